@@ -1,0 +1,1 @@
+"""How each algorithm learns: one file, one algorithm, one paper."""

@@ -1,0 +1,314 @@
+"""The agent: `fit` learns the dynamics, `clone` from demonstrations, `improve` the critics and the actor."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from mbdpg.agents import objectives
+from mbdpg.agents.mbdpg import instruments
+from mbdpg.agents.mbdpg.config import Config
+from mbdpg.agents.mbdpg.state import State
+from mbdpg.dynamics.fitting import Window, dynamics_loss, warm_memory
+from mbdpg.dynamics.imagination import ImaginationBuffer, Trajectory, imagine
+from mbdpg.dynamics.mixture import Memory, MixtureDynamics, Scales
+from mbdpg.interfaces import Batch, EnvSpec, Metrics, Phase, Sampling, Statistics
+from mbdpg.networks.critic import Critics
+from mbdpg.networks.normalizer import Normalizer, identity
+from mbdpg.networks.policy import Policy
+
+
+class Start(NamedTuple):
+    """Where imagination begins."""
+
+    observation: Float[Array, "batch observation"]
+    memory: Memory
+    weight: Float[Array, " batch"]
+    """Probability that the episode goes on here."""
+    depth: Float[Array, " batch"]
+    """Imagined steps since a real state; 0 where it is the state after the batch's own transition."""
+
+
+def optimizer(learning_rate: float, clip: float) -> optax.GradientTransformation:
+    """Adam behind a global-norm clip; a gradient that is not finite is skipped and counted in the state."""
+    return optax.apply_if_finite(
+        optax.chain(optax.clip_by_global_norm(clip), optax.adam(learning_rate, eps=1e-5)), max_consecutive_errors=10**9
+    )
+
+
+class MBDPG:
+    """Algorithm 1: `clone` is line 3, `fit` line 7 and `improve` lines 11 to 14."""
+
+    def __init__(self, config: Config, env: EnvSpec):
+        self.config = config
+        self.env = env
+        c = config
+        self._dynamics_optimizer = optimizer(c.dynamics_learning_rate, c.dynamics_clip)
+        self._actor_optimizer = optimizer(c.actor_learning_rate, c.actor_clip)
+        self._critic_optimizer = optimizer(c.critic_learning_rate, c.critic_clip)
+        fitted = Sampling(c.fit_batch_size, c.burn_in, c.fit_length)
+        cloned = Sampling(c.batch_size, burn_in=0, length=1, demonstrated=True)
+        improved = Sampling(c.batch_size * (1 + c.critic_updates), c.burn_in, length=1)
+        self.phases = (
+            Phase("cloning", 0.0, c.random_steps, cloned, c.cloning_updates, self.clone),
+            Phase("fitting", c.fits_per_step, c.random_steps, fitted, c.pretraining_fits, self.fit),
+            Phase("improving", c.updates_per_step, c.random_steps, improved, 0, self.improve),
+        )
+
+    def init(self, *, key: PRNGKeyArray) -> State:
+        """Fresh networks; targets equal to what they follow."""
+        c, o, a = self.config, self.env.observation_size, self.env.action_size
+        widths = (c.width,) * 3
+        dynamics_key, actor_key, critic_key = jax.random.split(key, 3)
+        dynamics = MixtureDynamics(o, a, gaussians=c.gaussians, memory=c.memory, widths=widths, key=dynamics_key)
+        actor = Policy(o, a, widths, key=actor_key)
+        critics = Critics(o, a, widths, key=critic_key)
+        one = jnp.ones(())
+        slots = 8 * c.batch_size
+        return State(
+            dynamics=dynamics,
+            actor=actor,
+            critics=critics,
+            target_actor=jax.tree.map(jnp.copy, actor),
+            target_critics=jax.tree.map(jnp.copy, critics),
+            dynamics_optimizer=self._dynamics_optimizer.init(dynamics),
+            actor_optimizer=self._actor_optimizer.init(actor),
+            critic_optimizer=self._critic_optimizer.init(critics),
+            normalizer=identity(o),
+            scales=Scales(jnp.ones(o), one, one),
+            return_scale=one,
+            imagined=ImaginationBuffer.empty(slots, o, dynamics.initial_memory((slots,))),
+            beta=jnp.asarray(c.beta, jnp.float32),
+            std=jnp.asarray(c.exploration_std, jnp.float32),
+            critic_steps=jnp.zeros(()),
+        )
+
+    def prepare(self, state: State, statistics: Statistics) -> State:
+        """Take over the replay's scales; beta and the behavior policy's spread follow the return (Section 4.3.2)."""
+        s, c, done = statistics, self.config, statistics.progress
+        return eqx.tree_at(
+            lambda x: (x.normalizer, x.scales, x.return_scale, x.beta, x.std),
+            state,
+            (
+                Normalizer(s.observation_mean, s.observation_std),
+                Scales(
+                    s.delta_std / s.observation_std,
+                    s.reward_std / s.return_scale,
+                    s.terminal_reward_scale / s.return_scale,
+                ),
+                s.return_scale,
+                c.beta + (c.final_beta - c.beta) * done,
+                c.exploration_std + (c.final_exploration_std - c.exploration_std) * done,
+            ),
+        )
+
+    def policy(self, state: State) -> tuple[Policy, Normalizer]:
+        """The deterministic policy mu."""
+        return state.actor, state.normalizer
+
+    def exploration_std(self, state: State) -> Array:
+        """Spread of the Gaussian behavior policy pi."""
+        return state.std
+
+    def fit(self, state: State, batch: Batch, *, key: PRNGKeyArray) -> tuple[State, Metrics]:
+        """One update of the dynamics (Eq. 11)."""
+        del key  # the loss is deterministic
+        c = self.config
+        gradient, metrics = jax.grad(dynamics_loss, has_aux=True)(
+            state.dynamics,
+            state.scales,
+            self._normalized(state, batch),
+            burn_in=c.burn_in,
+            likelihood=c.likelihood,
+            mean_weight=c.mean_weight,
+        )
+        updates, memory = self._dynamics_optimizer.update(gradient, state.dynamics_optimizer)
+        dynamics = optax.apply_updates(state.dynamics, updates)
+        metrics |= {"dynamics/grad_norm": optax.tree.norm(gradient), "dynamics/skipped": memory.total_notfinite}
+        return eqx.tree_at(lambda x: (x.dynamics, x.dynamics_optimizer), state, (dynamics, memory)), metrics
+
+    def clone(self, state: State, batch: Batch, *, key: PRNGKeyArray) -> tuple[State, Metrics]:
+        """Learn critics (Eq. 14) and actor (Eq. 15) from a batch of demonstrated transitions."""
+        window = self._normalized(state, batch)
+        state = self._evaluate(state, window, key=key)
+        observation, action = window.observation[:, -1], window.action[:, -1]
+
+        def loss(actor: Policy) -> Array:
+            return objectives.cloning_loss(actor(observation), action)
+
+        value, gradient = jax.value_and_grad(loss)(state.actor)
+        return self._step_actor(state, gradient), {"actor/cloning_loss": value}
+
+    def improve(self, state: State, batch: Batch, *, key: PRNGKeyArray) -> tuple[State, Metrics]:
+        """Critic updates on real transitions, then one of critics and actor on trajectories imagined from them."""
+        c = self.config
+        real_key, imagined_key = jax.random.split(key)
+        for i in range(c.critic_updates):
+            rows = slice(i * c.batch_size, (i + 1) * c.batch_size)
+            window = self._normalized(state, jax.tree.map(lambda x, rows=rows: x[rows, -1:], batch))
+            state = self._evaluate(state, window, key=jax.random.fold_in(real_key, i))
+        window = self._normalized(state, jax.tree.map(lambda x: x[-c.batch_size :], batch))
+        return self._imagine_and_improve(state, window, key=imagined_key)
+
+    def _normalized(self, state: State, batch: Batch) -> Window:
+        terminated = batch.terminated
+        value = batch.reward / state.return_scale
+        return Window(
+            observation=state.normalizer(batch.observation),
+            action=batch.action,
+            next_observation=state.normalizer(batch.next_observation),
+            reward=value * (1.0 - terminated) / state.scales.reward,
+            terminal_reward=value * terminated / state.scales.terminal_reward,
+            terminated=terminated,
+            valid=batch.valid,
+        )
+
+    def _real_reward(self, state: State, window: Window) -> Array:
+        """Rewards of the windows' last steps in units of value."""
+        scales = state.scales
+        return window.reward[:, -1] * scales.reward + window.terminal_reward[:, -1] * scales.terminal_reward
+
+    def _target_value(self, state: State, observation: Array, *, key: PRNGKeyArray) -> Array:
+        """Clipped value of the target policy's action, smoothed as in TD3."""
+        action = state.target_actor(observation)
+        noise = jnp.clip(self.config.target_noise * jax.random.normal(key, action.shape), -0.5, 0.5)
+        return objectives.clipped_value(state.target_critics(observation, jnp.clip(action + noise, -1.0, 1.0)))
+
+    def _evaluate(self, state: State, window: Window, *, key: PRNGKeyArray) -> State:
+        """One critic update on real transitions alone (Eq. 14 with targets and clipping)."""
+        next_value = self._target_value(state, window.next_observation[:, -1], key=key)
+        target = objectives.temporal_difference_target(
+            self._real_reward(state, window), window.terminated[:, -1], next_value, self.config.discount
+        )
+
+        def loss(critics: Critics) -> Array:
+            values = critics(window.observation[:, -1], window.action[:, -1])
+            return objectives.critic_loss(values, target, jnp.ones_like(target))
+
+        return self._step_critics(state, jax.grad(loss)(state.critics))
+
+    def _step_critics(self, state: State, gradient: Critics) -> State:
+        """Step the critics, then let the targets follow every C-th time."""
+        c = self.config
+        updates, memory = self._critic_optimizer.update(gradient, state.critic_optimizer)
+        critics = optax.apply_updates(state.critics, updates)
+        count = state.critic_steps + 1.0
+        rate = jnp.where(jnp.mod(count, c.target_update_every) == 0.0, c.target_update_rate, 0.0)
+        targets = optax.incremental_update((critics, state.actor), (state.target_critics, state.target_actor), rate)
+        return eqx.tree_at(
+            lambda x: (x.critics, x.critic_optimizer, x.target_critics, x.target_actor, x.critic_steps),
+            state,
+            (critics, memory, *targets, count),
+        )
+
+    def _step_actor(self, state: State, gradient: Policy) -> State:
+        updates, memory = self._actor_optimizer.update(gradient, state.actor_optimizer)
+        actor = optax.apply_updates(state.actor, updates)
+        return eqx.tree_at(lambda x: (x.actor, x.actor_optimizer), state, (actor, memory))
+
+    def _start(self, state: State, window: Window, *, key: PRNGKeyArray) -> Start:
+        """Where imagination starts: after each real transition, or for a share of them in the imagination buffer."""
+        memory = warm_memory(state.dynamics, window.observation, window.action, window.valid)
+        memory = jax.lax.stop_gradient(memory)
+        alive = 1.0 - window.terminated[:, -1]
+        real = Start(window.next_observation[:, -1], memory, alive, jnp.zeros_like(alive))
+        if self.config.imagination_ratio == 0.0:
+            return real
+        batch = alive.shape[0]
+        model = Start(*state.imagined.sample(batch, key=key))
+        use = (jnp.arange(batch) < round(self.config.imagination_ratio * batch)) & (model.weight > 0.0)
+        return jax.tree.map(lambda m, r: jnp.where(use.reshape((-1,) + (1,) * (r.ndim - 1)), m, r), model, real)
+
+    def _actor_loss(self, actor: Policy, state: State, start: Start) -> tuple[Array, tuple[Trajectory, Metrics]]:
+        """-J of Eq. 18 in units of the values' size; its derivative is Eq. 19 where `gradient` says so."""
+        c = self.config
+        printed = c.gradient == "eq19"
+        imagined = imagine(
+            state.dynamics,
+            state.scales,
+            actor,
+            start.observation,
+            start.memory,
+            horizon=c.horizon,
+            detach_policy_input=printed,
+        )
+        seen = imagined.observations[c.first_value :]
+        seen = jax.lax.stop_gradient(seen) if printed else seen
+        values = objectives.clipped_value(state.critics(seen, imagined.actions[c.first_value :]))
+        survival = jax.lax.stop_gradient(imagined.survival())
+        objective = objectives.policy_objective(
+            imagined.rewards, values, survival, discount=c.discount, beta=state.beta, reward_weights=c.reward_weights
+        )
+        count = jnp.maximum(jnp.sum(start.weight), 1.0)
+        mean = jnp.sum(objective * start.weight) / count
+        size = jax.lax.stop_gradient(jnp.maximum(jnp.mean(jnp.abs(objective)), 1.0))
+        saturation = jnp.mean(jnp.square(actor.mlp(start.observation)))
+        metrics = {"actor/objective": mean, "actor/saturation": saturation, "actor/survival": jnp.mean(survival[-1])}
+        return c.saturation_penalty * saturation - mean / size, (imagined, metrics)
+
+    def _imagine_and_improve(self, state: State, window: Window, *, key: PRNGKeyArray) -> tuple[State, Metrics]:
+        c = self.config
+        start_key, noise_key, real_key = jax.random.split(key, 3)
+        start = self._start(state, window, key=start_key)
+        gradient, (imagined, metrics) = jax.grad(self._actor_loss, has_aux=True)(state.actor, state, start)
+        imagined = jax.lax.stop_gradient(imagined)
+
+        values = self._target_value(state, imagined.observations, key=noise_key)
+        expanded = objectives.expanded_values(imagined.rewards, imagined.continues, values, c.discount, c.trace)
+        follows = start.depth == 0.0  # imagination went on from this very transition
+        one_step = self._target_value(state, window.next_observation[:, -1], key=real_key)
+        target = objectives.temporal_difference_target(
+            self._real_reward(state, window),
+            window.terminated[:, -1],
+            jnp.where(follows, expanded[0], one_step),
+            c.discount,
+        )
+
+        def loss(critics: Critics) -> tuple[Array, Array]:
+            real = critics(window.observation[:, -1], window.action[:, -1])
+            total = objectives.critic_loss(real, target, jnp.ones_like(target))
+            if c.imagined_weight > 0.0:
+                along = critics(imagined.observations[:-1], imagined.actions[:-1])
+                weights = imagined.survival()[:-1] * start.weight[None]
+                total += c.imagined_weight * objectives.critic_loss(along, expanded, weights)
+            return total, real
+
+        (critic_loss, real), critic_gradient = jax.value_and_grad(loss, has_aux=True)(state.critics)
+        metrics |= {
+            "critic/loss": critic_loss,
+            "critic/q_mean": jnp.mean(real) * state.return_scale,
+            "critic/grad_norm": optax.tree.norm(critic_gradient),
+            "actor/grad_norm": optax.tree.norm(gradient),
+            "actor/beta": state.beta,
+        }
+        state = self._step_critics(state, critic_gradient)
+        state = self._step_actor(state, gradient)
+        metrics |= {
+            "actor/skipped": state.actor_optimizer.total_notfinite,
+            "critic/skipped": state.critic_optimizer.total_notfinite,
+        }
+        if c.imagination_ratio > 0.0:
+            state = eqx.tree_at(lambda x: x.imagined, state, self._store(state.imagined, start, imagined))
+        return state, metrics
+
+    def _store(self, buffer: ImaginationBuffer, start: Start, imagined: Trajectory) -> ImaginationBuffer:
+        """Keep where imagination ended, unless it went too deep; then its start stands in, with weight 0."""
+        depth = start.depth + self.config.horizon
+        weight = imagined.survival()[-1] * start.weight * (depth <= self.config.imagination_depth)
+        return buffer.add(imagined.observations[-1], imagined.memory, weight, depth)
+
+    @property
+    def diagnosis(self) -> Sampling:
+        """Windows long enough for the deepest open-loop error."""
+        return Sampling(256, self.config.burn_in, max(instruments.DEPTHS))
+
+    def diagnose(self, state: State, batch: Batch, realized_return: Array, *, key: PRNGKeyArray) -> Metrics:
+        """Open-loop error, Q and survival against what happened, gradient norm per imagined depth."""
+        del key
+        window = self._normalized(state, batch)
+        return instruments.measure(self.config, state, window, realized_return)

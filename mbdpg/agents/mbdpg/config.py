@@ -1,0 +1,103 @@
+"""Settings of MBDPG."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from mbdpg.agents.objectives import RewardWeights
+from mbdpg.dynamics.fitting import Likelihood
+from mbdpg.interfaces import require_settings
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of MBDPG; symbols are the paper's."""
+
+    horizon: int = 5
+    """Imagined steps H that the critic is expanded over and the policy gradient flows through."""
+    gradient: Literal["full", "eq19"] = "full"
+    """Policy gradient: full differentiation of Eq. 18, or Eq. 19 as printed."""
+    discount: float = 0.99
+    """Discount factor gamma per environment step."""
+    batch_size: int = 128
+    """Trajectories imagined, and real transitions learned from, per actor and critic update."""
+    updates_per_step: float = 1.0
+    """Actor and critic updates per environment step."""
+    critic_updates: int = 0
+    """Further critic updates on real transitions alone before each imagined update."""
+    actor_learning_rate: float = 3e-4
+    """Adam's step size for the actor."""
+    critic_learning_rate: float = 3e-4
+    """Adam's step size for the critics."""
+    actor_clip: float = 10.0
+    """Global norm to which the actor's gradient is clipped."""
+    critic_clip: float = 10.0
+    """Global norm to which the critics' gradient is clipped."""
+    saturation_penalty: float = 1e-3
+    """Weight of the mean square of the policy's output before its tanh."""
+    beta: float = 1.0
+    """Weight beta of imagined rewards in Eq. 18 while returns are a random policy's."""
+    final_beta: float = 1.0
+    """Weight beta once returns reach the reference return; in between it follows the return."""
+    reward_weights: RewardWeights = "remaining"
+    """Reward t weighs beta times: the value terms after it ("remaining"), or one ("uniform", as printed)."""
+    first_value: Literal[0, 1] = 0
+    """Imagined step at which the value terms of Eq. 18 begin: 1 as printed, 0 to teach the first action by Q too."""
+    trace: float = 1.0
+    """Lambda of the value expansion: 1 is Eq. 16, smaller values trust shorter expansions more."""
+    imagined_weight: float = 0.5
+    """Weight of the critic's loss on imagined states beside that on real transitions."""
+    imagination_ratio: float = 0.0
+    """Share of imagination that starts from the imagination buffer instead of the environment's."""
+    imagination_depth: int = 20
+    """Greatest number of imagined steps between a state in the imagination buffer and a real one."""
+    target_update_rate: float = 0.005
+    """Share of the online networks that the targets take over at each of their updates (Polyak); 1 copies them."""
+    target_update_every: int = 1
+    """Actor and critic updates between two updates of the targets, the paper's C."""
+    target_noise: float = 0.2
+    """Standard deviation of the noise on target actions."""
+    exploration_std: float = 0.3
+    """Standard deviation of the behavior policy while returns are a random policy's."""
+    final_exploration_std: float = 0.1
+    """The same once returns reach the reference return; in between it follows the return."""
+    random_steps: int = 4000
+    """Environment steps with uniformly random actions before learning starts."""
+    fit_length: int = 10
+    """Open-loop steps L that the dynamics are trained over."""
+    burn_in: int = 5
+    """Real steps that fill the memory before an open-loop or imagined one."""
+    fit_batch_size: int = 64
+    """Windows per dynamics update."""
+    fits_per_step: float = 0.2
+    """Dynamics updates per environment step."""
+    pretraining_fits: int = 1000
+    """Dynamics updates on the random steps before the first actor and critic update."""
+    cloning_updates: int = 2000
+    """Updates of actor and critics on demonstrations, if there are any, before anything else (Section 4.2)."""
+    likelihood: Likelihood = "mixture"
+    """Negative log-likelihood of the mixture itself, or Eq. 11 as printed."""
+    mean_weight: float = 1.0
+    """Weight of the square error of the mixture's mean in the dynamics loss."""
+    dynamics_learning_rate: float = 3e-4
+    """Adam's step size for the dynamics."""
+    dynamics_clip: float = 10.0
+    """Global norm to which the dynamics' gradient is clipped."""
+    gaussians: int = 5
+    """Components M of the mixture."""
+    memory: int = 256
+    """Width of the LSTM."""
+    width: int = 256
+    """Width of each of the three dense layers of every network."""
+
+    def __post_init__(self) -> None:
+        require_settings(
+            self,
+            positive=(
+                *("horizon", "batch_size", "updates_per_step", "actor_learning_rate", "critic_learning_rate"),
+                *("actor_clip", "critic_clip", "target_update_every", "fit_length", "fit_batch_size", "fits_per_step"),
+                *("dynamics_learning_rate", "dynamics_clip", "gaussians", "memory", "width"),
+            ),
+            shares=("discount", "trace", "imagination_ratio", "target_update_rate"),
+        )

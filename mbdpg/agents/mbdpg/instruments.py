@@ -1,0 +1,71 @@
+"""Measurements of MBDPG on episodes that it has never learned from."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float
+
+from mbdpg.agents import objectives
+from mbdpg.agents.mbdpg.config import Config
+from mbdpg.agents.mbdpg.state import State
+from mbdpg.dynamics.fitting import Window, open_loop_error, warm_memory
+from mbdpg.dynamics.imagination import Trajectory, imagine
+from mbdpg.dynamics.mixture import Memory
+from mbdpg.interfaces import Metrics
+from mbdpg.networks.policy import Policy
+
+DEPTHS = (1, 5, 10, 20)
+"""Imagined steps after which the instruments look."""
+
+OUTLYING = 5.0
+"""An imagined observation entry beyond this many standard deviations counts as out of the data's range."""
+
+
+def measure(config: Config, state: State, window: Window, realized_return: Float[Array, " batch"]) -> Metrics:
+    """All instruments at once.
+
+    Args:
+        config: the agent's.
+        state: the agent's.
+        window: `burn_in` steps, then as many as the greatest depth, of evaluation episodes.
+        realized_return: discounted return that followed the first step after the burn-in, NaN where unknown.
+    """
+    past = slice(0, config.burn_in)
+    memory = warm_memory(state.dynamics, window.observation[:, past], window.action[:, past], window.valid[:, past])
+    now = window.observation[:, config.burn_in]
+    value = objectives.clipped_value(state.critics(now, window.action[:, config.burn_in])) * state.return_scale
+    imagined = _imagine(state, state.actor, now, memory, depth=max(DEPTHS), printed=False)
+    ended = jnp.max(window.terminated[:, config.burn_in :] * window.valid[:, config.burn_in :], axis=1)
+    return (
+        open_loop_error(state.dynamics, state.scales, window, burn_in=config.burn_in, depths=DEPTHS)
+        | objectives.value_bias(value, realized_return)
+        | {
+            "dynamics/survival_imagined": jnp.mean(imagined.survival()[-1]),
+            "dynamics/survival_observed": 1.0 - jnp.mean(ended),
+            "dynamics/out_of_range": jnp.mean(jnp.abs(imagined.observations[1:]) > OUTLYING),
+        }
+        | {
+            f"actor/grad_norm_k{depth:02d}": _gradient_norm(config, state, now, memory, depth)
+            for depth in DEPTHS
+            if depth <= config.horizon
+        }
+    )
+
+
+def _gradient_norm(config: Config, state: State, start: Array, memory: Memory, depth: int) -> Array:
+    """Norm of the derivative of E[Q(s_t, a_t)], t = depth, with respect to the actor's parameters."""
+    printed = config.gradient == "eq19"
+
+    def value(actor: Policy) -> Array:
+        imagined = _imagine(state, actor, start, memory, depth=depth, printed=printed)
+        seen = imagined.observations[-1]
+        seen = jax.lax.stop_gradient(seen) if printed else seen
+        return jnp.mean(objectives.clipped_value(state.critics(seen, imagined.actions[-1])))
+
+    return optax.tree.norm(jax.grad(value)(state.actor))
+
+
+def _imagine(state: State, actor: Policy, start: Array, memory: Memory, *, depth: int, printed: bool) -> Trajectory:
+    return imagine(state.dynamics, state.scales, actor, start, memory, horizon=depth, detach_policy_input=printed)

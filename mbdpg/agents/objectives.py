@@ -1,0 +1,104 @@
+"""Eq. 14-20 as equations, nothing else. Corrections to the printed ones are argued in docs/deviations.md."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mbdpg.interfaces import Metrics
+
+RewardWeights = Literal["uniform", "remaining"]
+
+
+def clipped_value(values: Float[Array, "critic *batch"]) -> Float[Array, "*batch"]:
+    """Q = min_i Q_i (Eq. 17), for targets and for the actor; each critic is regressed by itself."""
+    return jnp.min(values, axis=0)
+
+
+def temporal_difference_target(
+    reward: Float[Array, " batch"],
+    terminated: Float[Array, " batch"],
+    next_value: Float[Array, " batch"],
+    discount: float,
+) -> Float[Array, " batch"]:
+    """r + gamma (1 - d) Q(s', a') (Eq. 14, with the termination it omits)."""
+    return reward + discount * (1.0 - terminated) * next_value
+
+
+def expanded_values(
+    rewards: Float[Array, "time batch"],
+    continues: Float[Array, "time batch"],
+    values: Float[Array, "state batch"],
+    discount: float,
+    trace: float,
+) -> Float[Array, "time batch"]:
+    """The value expansion of Eq. 16: for every t, sum_{h=t}^{H-1} gamma^{h-t} r_{h+1} + gamma^{H-t} Q(s_H, a_H).
+
+    As printed the powers are gamma^h, which would teach Q(s_t) the value gamma^t Q for t > 0. Beyond the paper, each
+    step counts by the probability of still being alive, and `trace` (lambda) < 1 averages over shorter expansions
+    geometrically, as in TD(lambda): 1 is Eq. 16, 0 the one-step target.
+    """
+
+    def step(after: Array, inputs: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+        reward, alive, next_value = inputs
+        target = reward + discount * alive * ((1.0 - trace) * next_value + trace * after)
+        return target, target
+
+    return jax.lax.scan(step, values[-1], (rewards, continues, values[1:]), reverse=True)[1]
+
+
+def critic_loss(
+    values: Float[Array, "critic *batch"], targets: Float[Array, "*batch"], weights: Float[Array, "*batch"]
+) -> Float[Array, ""]:
+    """Weighted mean square error of every critic to one shared target (Eq. 14, 16), summed over the critics."""
+    errors = jnp.square(values - jax.lax.stop_gradient(targets)[None])
+    return jnp.sum(errors * weights[None]) / jnp.maximum(jnp.sum(weights), 1.0)
+
+
+def policy_objective(
+    rewards: Float[Array, "time batch"],
+    values: Float[Array, "value batch"],
+    survival: Float[Array, "state batch"],
+    *,
+    discount: float,
+    beta: Float[Array, ""],
+    reward_weights: RewardWeights,
+) -> Float[Array, " batch"]:
+    """J = beta sum_{t<H} gamma^t r_{t+1} + sum_t gamma^t Q(s_t, a_t) (Eq. 18), per value term.
+
+    Args:
+        rewards: imagined, H of them.
+        values: Q along the trajectory: H of them from t = 1 as printed, or H + 1 from t = 0.
+        survival: probability of being alive at each of the H + 1 states.
+        discount: gamma.
+        beta: weight of the imagined rewards.
+        reward_weights: "uniform" as printed; "remaining" weighs reward t by the H - t value terms that follow it.
+            Only then is J, with beta = 1, the sum of all n-step returns, in which every reward counts alike whether
+            it falls before or behind a value term.
+    """
+    horizon = rewards.shape[0]
+    powers = discount ** jnp.arange(horizon + 1, dtype=rewards.dtype)[:, None] * survival
+    remaining = horizon - jnp.arange(horizon, dtype=rewards.dtype)
+    weights = beta * (remaining if reward_weights == "remaining" else jnp.ones_like(remaining))
+    total = jnp.sum(weights[:, None] * powers[:-1] * rewards, axis=0)
+    total += jnp.sum(powers[horizon + 1 - values.shape[0] :] * values, axis=0)
+    return total / values.shape[0]
+
+
+def cloning_loss(actions: Float[Array, "batch action"], demonstrated: Float[Array, "batch action"]) -> Float[Array, ""]:
+    """Behavioral cloning, E[(mu(s) - a)^2] (Eq. 15)."""
+    return jnp.mean(jnp.sum(jnp.square(actions - demonstrated), axis=-1))
+
+
+def value_bias(value: Float[Array, " batch"], realized_return: Float[Array, " batch"]) -> Metrics:
+    """Means of a critic's value and of the discounted return that followed, where that is known (not NaN)."""
+    known = jnp.isfinite(realized_return)
+    count = jnp.maximum(jnp.sum(known), 1.0)
+    realized = jnp.sum(jnp.where(known, realized_return, 0.0)) / count
+    return {
+        "critic/q_bias": jnp.sum(jnp.where(known, value, 0.0)) / count - realized,
+        "critic/realized_return": realized,
+    }

@@ -1,0 +1,131 @@
+"""The library: the command line's verbs as typed calls, for registered environments and for your own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+
+from mbdpg import envs
+from mbdpg.agents import mbdpg, td3
+from mbdpg.experiments import run
+from mbdpg.interfaces import Environment
+from mbdpg.networks.policy import NumpyPolicy
+from mbdpg.training.evaluation import Evaluation
+from mbdpg.training.evaluation import evaluate as run_episodes
+from mbdpg.training.loop import Schedule, Update
+
+Env = str | Callable[[], gymnasium.Env]
+"""A Gymnasium id, or a function that makes an environment."""
+
+
+def train(
+    env: Env,
+    *,
+    config: mbdpg.Config | td3.Config | None = None,
+    schedule: Schedule | None = None,
+    seeds: Sequence[int] = (0,),
+    out: str | Path,
+    demonstrations: str | Path | None = None,
+    on_evaluation: Callable[[Update], None] | None = None,
+) -> list[Path]:
+    """Train an agent; its config's type says which.
+
+    Args:
+        env: a Gymnasium id, or a function that makes an environment (called a few times).
+        config: the agent's settings; by default MBDPG's own.
+        schedule: length of the run, and how often it evaluates and saves.
+        seeds: one run each, all in this process.
+        out: a folder that gets one run folder `seed-<seed>` per seed.
+        demonstrations: a file that `mbdpg demonstrate` wrote.
+        on_evaluation: called after every evaluation.
+
+    Returns:
+        The run folders.
+
+    Raises:
+        UserError: something you can mend, said in one line.
+    """
+    agent = mbdpg.Config() if config is None else config
+    settings = run.RunConfig(
+        env=env if isinstance(env, str) else _name(env),
+        algorithm="td3" if isinstance(agent, td3.Config) else "mbdpg",
+        agent=agent,
+        schedule=schedule or Schedule(),
+        demonstrations=None if demonstrations is None else str(demonstrations),
+    )
+    return run.train(
+        settings, seeds=seeds, out=Path(out), make_env=_maker(env), on_update=_only_evaluations(on_evaluation)
+    )
+
+
+def resume(
+    path: str | Path,
+    *,
+    env: Callable[[], gymnasium.Env] | None = None,
+    steps: int | None = None,
+    on_evaluation: Callable[[Update], None] | None = None,
+) -> None:
+    """Go on with a run exactly where it stopped.
+
+    Args:
+        path: the run folder.
+        env: makes the environment, if the run was given such a function.
+        steps: environment steps of the whole run, if it shall be longer than planned.
+        on_evaluation: called after every evaluation.
+
+    Raises:
+        UserError: not a run, or damaged beyond its checkpoints.
+    """
+    run.resume(Path(path), make_env=_maker(env), steps=steps, on_update=_only_evaluations(on_evaluation))
+
+
+def load_policy(path: str | Path, *, best: bool = False) -> NumpyPolicy:
+    """The policy of a run: a function from one raw observation to one action in [-1, 1], in NumPy alone.
+
+    Args:
+        path: the run folder.
+        best: the policy with the best evaluation, instead of the latest.
+
+    Raises:
+        UserError: there is none, or it is damaged.
+    """
+    return run.load_policy(Path(path), best=best)
+
+
+def evaluate(env: Env, policy: Callable[[np.ndarray], np.ndarray], *, episodes: int = 10, seed: int = 0) -> Evaluation:
+    """Run episodes without exploration.
+
+    Args:
+        env: a Gymnasium id, or a function that makes an environment.
+        policy: actions in [-1, 1] from raw observations.
+        episodes: how many.
+        seed: decides the episodes' own seeds.
+    """
+    make = _maker(env)
+    made = envs.make(str(env)) if make is None else make()
+    try:
+        return run_episodes(made, policy, [envs.episode_seed(seed, "evaluate", i) for i in range(episodes)])
+    finally:
+        made.close()
+
+
+def _maker(env: Env | None) -> Callable[[], Environment] | None:
+    """A function that makes the environment and wraps it; None for a registered one."""
+    if env is None or isinstance(env, str):
+        return None
+    return lambda: envs.wrap(env(), name=_name(env))
+
+
+def _name(env: Callable[[], gymnasium.Env]) -> str:
+    return str(getattr(env, "__name__", type(env).__name__))
+
+
+def _only_evaluations(on_evaluation: Callable[[Update], None] | None) -> Callable[[Update], None]:
+    def on_update(update: Update) -> None:
+        if on_evaluation is not None and update.evaluation is not None:
+            on_evaluation(update)
+
+    return on_update

@@ -1,0 +1,151 @@
+"""Multi-step training of the dynamics (Section 4.1.2, Eq. 11) and its error on data it has not seen."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mbdpg.dynamics.mixture import Memory, MixtureDynamics, Prediction, Scales, next_observation
+from mbdpg.interfaces import Metrics
+
+Likelihood = Literal["mixture", "eq11"]
+
+
+class Window(NamedTuple):
+    """Consecutive steps of one episode in normalized units; `valid` is 0 before its start and after its end."""
+
+    observation: Float[Array, "*batch time observation"]
+    action: Float[Array, "*batch time action"]
+    next_observation: Float[Array, "*batch time observation"]
+    reward: Float[Array, "*batch time"]
+    terminal_reward: Float[Array, "*batch time"]
+    terminated: Float[Array, "*batch time"]
+    valid: Float[Array, "*batch time"]
+
+
+def warm_memory(
+    dynamics: MixtureDynamics,
+    observations: Float[Array, "batch time observation"],
+    actions: Float[Array, "batch time action"],
+    valid: Float[Array, "batch time"],
+) -> Memory:
+    """The memory after real steps, teacher-forced from zeros; steps that are not valid leave it at zero."""
+
+    def step(memory: Memory, inputs: tuple[Array, Array, Array]) -> tuple[Memory, None]:
+        observation, action, exists = inputs
+        new = dynamics.remember(memory, observation, action)
+        return Memory(new.hidden * exists[:, None], new.cell * exists[:, None]), None
+
+    time_first = (jnp.swapaxes(observations, 0, 1), jnp.swapaxes(actions, 0, 1), jnp.swapaxes(valid, 0, 1))
+    return jax.lax.scan(step, dynamics.initial_memory(valid.shape[:1]), time_first)[0]
+
+
+def open_loop(
+    dynamics: MixtureDynamics,
+    scales: Scales,
+    start: Float[Array, "batch observation"],
+    memory: Memory,
+    actions: Float[Array, "batch time action"],
+) -> tuple[Prediction, Float[Array, "state batch observation"]]:
+    """Execute `actions` in the model from a real state, feeding its own predictions back (Fig. 2).
+
+    Returns:
+        The predictions of every step, time first, and the observations passed through, from `start` to the last.
+    """
+
+    def step(carry: tuple[Array, Memory], action: Array) -> tuple[tuple[Array, Memory], tuple[Prediction, Array]]:
+        observation, memory = carry
+        memory = dynamics.remember(memory, observation, action)
+        prediction = dynamics.predict(memory, observation, action)
+        after = next_observation(observation, prediction.mean(), scales)
+        return (after, memory), (prediction, after)
+
+    prediction, reached = jax.lax.scan(step, (start, memory), jnp.swapaxes(actions, 0, 1))[1]
+    return prediction, jnp.concatenate([start[None], reached])
+
+
+def mixture_nll(
+    prediction: Prediction, target: Float[Array, "*batch observation"], likelihood: Likelihood
+) -> Float[Array, "*batch"]:
+    """Negative log-likelihood per observation entry, without its constant.
+
+    `mixture` is that of the mixture itself, -log sum_i alpha_i p_i. `eq11` is the paper's -sum_i alpha_i log p_i,
+    an upper bound of it (Jensen) that is linear in alpha, so that the best weights for an input are one-hot.
+    """
+    normed = (target[..., None, :] - prediction.means) * jnp.exp(-prediction.log_stds)
+    log_p = -jnp.sum(0.5 * jnp.square(normed) + prediction.log_stds, axis=-1)
+    if likelihood == "eq11":
+        nll = -jnp.sum(jnp.exp(prediction.log_weights) * log_p, axis=-1)
+    else:
+        nll = -jax.nn.logsumexp(prediction.log_weights + log_p, axis=-1)
+    return nll / target.shape[-1]
+
+
+def dynamics_loss(
+    dynamics: MixtureDynamics,
+    scales: Scales,
+    window: Window,
+    *,
+    burn_in: int,
+    likelihood: Likelihood,
+    mean_weight: float,
+) -> tuple[Float[Array, ""], Metrics]:
+    """Eq. 11 over L open-loop steps after `burn_in` teacher-forced ones, with the heads the tasks need.
+
+    To the likelihood of the state and the squared error of the reward come the squared error of the mixture's mean
+    (planning uses nothing else), the squared error of the terminal reward on terminal steps alone, and the cross
+    entropy of the continuation. Steps after an episode's end do not count.
+    """
+    lead = slice(0, burn_in)
+    memory = warm_memory(dynamics, window.observation[:, lead], window.action[:, lead], window.valid[:, lead])
+    future = jax.tree.map(lambda x: jnp.swapaxes(x[:, burn_in:], 0, 1), window)
+    prediction, imagined = open_loop(dynamics, scales, future.observation[0], memory, jnp.swapaxes(future.action, 0, 1))
+    target = (future.next_observation - imagined[:-1]) / scales.delta.reshape(1, 1, -1)
+    alive = future.valid * (1.0 - future.terminated)
+    dead = future.valid * future.terminated
+    count = jnp.maximum(jnp.sum(future.valid), 1.0)
+
+    def average(x: Array, weights: Array) -> Array:
+        return jnp.sum(x * weights) / count
+
+    nll = average(mixture_nll(prediction, target, likelihood), future.valid)
+    mean_error = average(jnp.mean(jnp.square(prediction.mean() - target), axis=-1), future.valid)
+    reward_error = average(jnp.square(prediction.reward - future.reward), alive)
+    terminal_error = average(jnp.square(prediction.terminal_reward - future.terminal_reward), dead)
+    logit = prediction.continue_logit
+    ending = average(jax.nn.softplus(-logit), alive) + average(jax.nn.softplus(logit), dead)
+    loss = nll + mean_weight * mean_error + reward_error + terminal_error + ending
+    weights = jnp.exp(prediction.log_weights)
+    entropy = -jnp.sum(weights * prediction.log_weights, axis=-1)
+    return loss, {
+        "dynamics/nll": nll,
+        "dynamics/mean_mse": mean_error,
+        "dynamics/reward_mse": reward_error,
+        "dynamics/continue_bce": ending,
+        "dynamics/gate_entropy": average(entropy, future.valid),
+    }
+
+
+def open_loop_error(
+    dynamics: MixtureDynamics, scales: Scales, window: Window, *, burn_in: int, depths: tuple[int, ...]
+) -> Metrics:
+    """Root mean square error of open-loop prediction at each depth, beside that of persistence (no change at all).
+
+    In standard deviations of the observation, over steps whose whole past lies in the window.
+    """
+    lead = slice(0, burn_in)
+    memory = warm_memory(dynamics, window.observation[:, lead], window.action[:, lead], window.valid[:, lead])
+    start = window.observation[:, burn_in]
+    _, imagined = open_loop(dynamics, scales, start, memory, window.action[:, burn_in:])
+    metrics: Metrics = {}
+    for depth in depths:
+        exists = window.valid[:, burn_in + depth - 1]
+        truth = window.next_observation[:, burn_in + depth - 1]
+        count = jnp.maximum(jnp.sum(exists), 1.0)
+        for name, guess in (("rmse", imagined[depth]), ("persistence", start)):
+            square = jnp.mean(jnp.square(guess - truth), axis=-1)
+            metrics[f"dynamics/{name}_k{depth:02d}"] = jnp.sqrt(jnp.sum(square * exists) / count)
+    return metrics

@@ -1,0 +1,120 @@
+"""Trajectories imagined in the learned dynamics (Section 4.3, Algorithm 1 line 11)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from mbdpg.dynamics.mixture import Memory, MixtureDynamics, Scales, next_observation
+
+
+UNROLLED = 5
+"""Steps per iteration of the compiled loop: XLA on CPU copies what a loop carries, and fuses nothing across it."""
+
+
+class Trajectory(NamedTuple):
+    """H imagined steps; the time axis is `time` = H for what happens in a step and `state` = H + 1 for states."""
+
+    observations: Float[Array, "state *batch observation"]
+    actions: Float[Array, "state *batch action"]
+    """The last action is the policy's at the final state; no step is taken with it."""
+    rewards: Float[Array, "time *batch"]
+    """In units of the return scale; the terminal reward is mixed in by the probability of an end."""
+    continues: Float[Array, "time *batch"]
+    """Probability that the episode goes on after this step."""
+    memory: Memory
+    """After the last step."""
+
+    def survival(self) -> Float[Array, "state *batch"]:
+        """Probability of still being alive at each state: 1 at the first, then the product of `continues`."""
+        return jnp.concatenate([jnp.ones_like(self.continues[:1]), jnp.cumprod(self.continues, axis=0)])
+
+
+def imagine(
+    dynamics: MixtureDynamics,
+    scales: Scales,
+    policy: Callable[[Array], Array],
+    start: Float[Array, "*batch observation"],
+    memory: Memory,
+    *,
+    horizon: int,
+    detach_policy_input: bool = False,
+    key: PRNGKeyArray | None = None,
+) -> Trajectory:
+    """Follow `policy` for `horizon` steps from normalized observations `start`.
+
+    Args:
+        dynamics: the Mixture Gaussian Network.
+        scales: its units.
+        policy: actions from normalized observations.
+        start: first observations; gradient flows from each state to the next, and to every action.
+        memory: the LSTM's state before the first step.
+        horizon: H, the number of steps (the paper's 20).
+        detach_policy_input: stop the gradient from actions to the states they were chosen in (the reading of Eq. 19).
+        key: draw the next states from the mixture (Eq. 5, 12); without it they are deterministic (Eq. 13).
+    """
+
+    def act(observation: Array) -> Array:
+        return policy(jax.lax.stop_gradient(observation) if detach_policy_input else observation)
+
+    def step(carry: tuple[Array, Memory], t: Array) -> tuple[tuple[Array, Memory], tuple[Array, ...]]:
+        observation, memory = carry
+        action = act(observation)
+        memory = dynamics.remember(memory, observation, action)
+        prediction = dynamics.predict(memory, observation, action)
+        delta = prediction.mean() if key is None else prediction.sample(key=jax.random.fold_in(key, t))
+        alive = jax.nn.sigmoid(prediction.continue_logit)
+        reward = alive * prediction.reward * scales.reward
+        reward += (1.0 - alive) * prediction.terminal_reward * scales.terminal_reward
+        return (next_observation(observation, delta, scales), memory), (observation, action, reward, alive)
+
+    (last, memory), (observations, actions, rewards, continues) = jax.lax.scan(
+        step, (start, memory), jnp.arange(horizon), unroll=min(horizon, UNROLLED)
+    )
+    return Trajectory(
+        observations=jnp.concatenate([observations, last[None]]),
+        actions=jnp.concatenate([actions, act(last)[None]]),
+        rewards=rewards,
+        continues=continues,
+        memory=memory,
+    )
+
+
+class ImaginationBuffer(NamedTuple):
+    """D_model of Algorithm 1: imagined states from which further imagination may start; a ring."""
+
+    observation: Float[Array, "slot observation"]
+    memory: Memory
+    weight: Float[Array, " slot"]
+    """Probability of being alive there."""
+    depth: Float[Array, " slot"]
+    """Imagined steps between the last real state and this one."""
+    added: Float[Array, ""]
+    """States ever added."""
+
+    @classmethod
+    def empty(cls, slots: int, observation_size: int, memory: Memory) -> ImaginationBuffer:
+        """No states; `memory` is one of shape (slots, memory)."""
+        return cls(jnp.zeros((slots, observation_size)), memory, jnp.zeros(slots), jnp.zeros(slots), jnp.zeros(()))
+
+    def add(self, observation: Array, memory: Memory, weight: Array, depth: Array) -> ImaginationBuffer:
+        """Overwrite the oldest states with a batch of new ones; the batch divides the number of slots."""
+        slots, batch = self.weight.shape[0], weight.shape[0]
+        at = jnp.mod(self.added, slots).astype(jnp.int32)
+        new = ImaginationBuffer(observation, memory, weight, depth, self.added)
+
+        def write(old: Array, fresh: Array) -> Array:
+            return fresh if old.ndim == 0 else jax.lax.dynamic_update_slice_in_dim(old, fresh, at, axis=0)
+
+        return jax.tree.map(write, self, new)._replace(added=self.added + batch)
+
+    def sample(self, batch: int, *, key: PRNGKeyArray) -> tuple[Array, Memory, Array, Array]:
+        """Observations, memories, weights and depths of states drawn uniformly; weight 0 while there are none."""
+        filled = jnp.minimum(self.added, self.weight.shape[0])
+        rows = (jax.random.uniform(key, (batch,)) * filled).astype(jnp.int32)
+        memory = Memory(self.memory.hidden[rows], self.memory.cell[rows])
+        return self.observation[rows], memory, self.weight[rows], self.depth[rows]

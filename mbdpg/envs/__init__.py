@@ -1,0 +1,3 @@
+"""Where Gymnasium ends: everything past this package sees `mbdpg.interfaces.Environment` alone."""
+
+from mbdpg.envs.make import episode_seed as episode_seed, make as make, wrap as wrap

@@ -1,0 +1,1 @@
+"""What is run: configurations, and the one place where a run's parts are put together."""

@@ -1,0 +1,56 @@
+"""Values per preset, algorithm and environment; data only. docs/deviations.md has the evidence for the defaults."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from mbdpg.agents import mbdpg, td3
+from mbdpg.interfaces import UserError
+
+Algorithm = Literal["mbdpg", "td3"]
+Preset = Literal["default", "paper"]
+
+CONFIGS: dict[Algorithm, type[mbdpg.Config] | type[td3.Config]] = {"mbdpg": mbdpg.Config, "td3": td3.Config}
+
+PAPER: dict[Algorithm, dict[str, Any]] = {
+    # Section 5.1 and 5.3.1, and Eq. 11, 16, 18 and 19 as printed where that can be learned from at all.
+    "mbdpg": {
+        "horizon": 20,
+        "gradient": "eq19",
+        "discount": 0.99,
+        "batch_size": 128,
+        "updates_per_step": 1.0,
+        "actor_learning_rate": 2e-4,
+        "critic_learning_rate": 2e-4,
+        "dynamics_learning_rate": 2e-4,
+        "beta": 1.0,
+        "final_beta": 0.0,
+        "reward_weights": "uniform",
+        "first_value": 1,
+        "trace": 1.0,
+        "target_update_rate": 1.0,
+        "target_update_every": 3,
+        "random_steps": 4000,
+        "fit_length": 10,
+        "burn_in": 190,
+        "fit_batch_size": 128,
+        "likelihood": "eq11",
+        "mean_weight": 0.0,
+        "gaussians": 5,
+        "width": 256,
+    },
+    "td3": {},
+}
+
+PAPER_SCHEDULE: dict[str, Any] = {"steps": 200_000}
+PAPER_EPISODE_LIMIT = 1000
+"""Section 5.1 cuts every episode, in training and test, at 1,000 steps."""
+
+
+def agent_config(algorithm: Algorithm, preset: Preset) -> mbdpg.Config | td3.Config:
+    """The algorithm's settings under a preset."""
+    if algorithm not in CONFIGS:
+        raise UserError(f"unknown algorithm {algorithm!r}; expected one of {', '.join(CONFIGS)}")
+    if preset not in ("default", "paper"):
+        raise UserError(f"unknown preset {preset!r}; expected default or paper")
+    return CONFIGS[algorithm](**(PAPER[algorithm] if preset == "paper" else {}))

@@ -1,0 +1,296 @@
+"""The composition root: everything a run consists of, built in one call."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import subprocess
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mbdpg import envs
+from mbdpg.agents import mbdpg, td3
+from mbdpg.experiments.presets import CONFIGS, Algorithm
+from mbdpg.imitation.demonstrations import Demonstrations
+from mbdpg.interfaces import Agent, Environment, EnvSpec, Metrics, UserError, require
+from mbdpg.networks.policy import NumpyPolicy
+from mbdpg.storage.array_file import read_array_file, write_array_file
+from mbdpg.storage.checkpoint import Checkpoint, CheckpointWriter, load_checkpoint
+from mbdpg.storage.metrics import MetricsLog
+from mbdpg.storage.run_folder import RunFolder, describe_machine
+from mbdpg.training.collector import Collector
+from mbdpg.training.learner import Learner
+from mbdpg.training.loop import Schedule, Training, Update
+from mbdpg.training.replay import Replay
+
+MakeEnvironment = Callable[[], Environment]
+OnUpdate = Callable[[Update], None]
+
+
+@dataclass(frozen=True)
+class EnvOptions:
+    """How the environment is made."""
+
+    max_episode_steps: int | None = None
+    """Steps after which an episode is truncated, instead of the environment's own limit."""
+    observation_size: int | None = None
+    """27 or 105, for Ant-v5: without or with contact forces."""
+    allow_import: bool = False
+    """Allow an id of the form module:Id, which imports and so runs that module's code."""
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Everything that decides a run, but for its seed."""
+
+    env: str
+    """Gymnasium id, or a name for an environment made in code."""
+    algorithm: Algorithm = "mbdpg"
+    agent: mbdpg.Config | td3.Config = field(default_factory=mbdpg.Config)
+    schedule: Schedule = field(default_factory=Schedule)
+    env_options: EnvOptions = field(default_factory=EnvOptions)
+    demonstrations: str | None = None
+    """File of demonstrations to begin with."""
+
+    def make_env(self, *, render: bool = False) -> Environment:
+        """The environment, from Gymnasium's registry."""
+        return envs.make(self.env, render=render, **dataclasses.asdict(self.env_options))
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> RunConfig:
+        """Read what a run's config.json holds.
+
+        Raises:
+            UserError: a field is unknown, missing or of the wrong type.
+        """
+        algorithm = data.get("algorithm")
+        require(
+            algorithm in CONFIGS, f"config.json has algorithm {str(algorithm)[:40]!r}, expected {', '.join(CONFIGS)}"
+        )
+        demonstrations, env = data.get("demonstrations"), data.get("env")
+        require(isinstance(env, str), "config.json does not say which environment the run is of")
+        require(demonstrations is None or isinstance(demonstrations, str), "config.json has odd demonstrations")
+        return cls(
+            env=str(env),
+            algorithm=algorithm,  # type: ignore[arg-type]  # checked above
+            agent=_settings(CONFIGS[algorithm], data.get("agent"), "agent"),  # type: ignore[index]
+            schedule=_settings(Schedule, data.get("schedule"), "schedule"),
+            env_options=_settings(EnvOptions, data.get("env_options"), "env_options"),
+            demonstrations=demonstrations,
+        )
+
+
+def train(
+    config: RunConfig,
+    *,
+    seeds: Sequence[int],
+    out: Path,
+    make_env: MakeEnvironment | None = None,
+    on_update: OnUpdate = lambda update: None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> list[Path]:
+    """Train from the beginning, all seeds in one process.
+
+    Args:
+        config: what to run.
+        seeds: one run each.
+        out: folder that gets one run folder, `seed-<seed>`, per seed.
+        make_env: makes the environment, where it is not `config.env` from Gymnasium's registry.
+        on_update: called after every cycle.
+        should_stop: asked often; when it says yes, the run is saved and ended.
+
+    Returns:
+        The run folders.
+
+    Raises:
+        UserError: something the caller can mend; then no folder is left behind.
+    """
+    require(len(seeds) > 0 and len(set(seeds)) == len(seeds), f"seeds are {list(seeds)}, expected different numbers")
+    require(all(0 <= seed < 2**31 for seed in seeds), f"seeds are {list(seeds)}, expected numbers from 0 to 2^31 - 1")
+    make = make_env or config.make_env
+    spec = _spec_of(make)
+    demonstrations = Demonstrations.load(Path(config.demonstrations), spec) if config.demonstrations else None
+    description = dataclasses.asdict(config) | {"commit": _commit(), "machine": describe_machine()}
+    with contextlib.ExitStack() as stack:
+        folders = []
+        for seed in seeds:
+            facts = {"seed": seed, "custom_env": make_env is not None}
+            folders.append(RunFolder.create(out / f"seed-{seed}", description | facts))
+            stack.enter_context(folders[-1].locked())
+        training = _compose(config, spec, make, seeds, [_Recorder(folder) for folder in folders], stack, demonstrations)
+        training.save()
+        training.run(on_update, should_stop)
+    return [folder.path for folder in folders]
+
+
+def resume(
+    path: Path,
+    *,
+    make_env: MakeEnvironment | None = None,
+    steps: int | None = None,
+    on_start: Callable[[RunConfig, int], None] = lambda config, env_steps: None,
+    on_update: OnUpdate = lambda update: None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> RunConfig:
+    """Go on with one run exactly where its newest undamaged checkpoint is.
+
+    Args:
+        path: the run folder.
+        make_env: as for `train`; needed if the run was given one.
+        steps: environment steps of the whole run, if it shall be longer than it was meant to be.
+        on_start: called with the run's config and the step it goes on from.
+        on_update: as for `train`.
+        should_stop: as for `train`.
+
+    Raises:
+        UserError: not a run, damaged beyond its checkpoints, or of another configuration or environment.
+    """
+    folder = RunFolder.open(path)
+    config = RunConfig.from_json(folder.config)
+    if steps is not None:
+        require(steps >= config.schedule.steps, f"--steps is {steps}, less than the run's own {config.schedule.steps}")
+        config = dataclasses.replace(config, schedule=dataclasses.replace(config.schedule, steps=steps))
+    if folder.config.get("custom_env") and make_env is None:
+        raise UserError(f"{path} trained an environment made in code; resume it with mbdpg.resume(..., env=...)")
+    make = make_env or config.make_env
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(folder.locked())
+        checkpoint = load_checkpoint(path)
+        recorder = _Recorder(folder, checkpoint)
+        training = _compose(config, _spec_of(make), make, [_seed_of(folder)], [recorder], stack, None, checkpoint)
+        on_start(config, training.env_steps)
+        training.run(on_update, should_stop)
+    return config
+
+
+def load_policy(path: Path, *, best: bool = False) -> NumpyPolicy:
+    """The policy of a run folder: its latest, or the one with the best evaluation.
+
+    Raises:
+        UserError: there is none, or it is damaged.
+    """
+    name = path / "policy" / ("best.safetensors" if best else "latest.safetensors")
+    if not name.is_file():
+        raise UserError(f"{path} has no {name.name} yet; expected a run folder that has evaluated at least once")
+    try:
+        return NumpyPolicy(read_array_file(name, "policy")[0])
+    except ValueError as error:
+        raise UserError(f"{name} is not a policy: {error}") from error
+
+
+class _Recorder:
+    """Writes one seed's run folder."""
+
+    def __init__(self, folder: RunFolder, checkpoint: Checkpoint | None = None):
+        facts = checkpoint.facts["recorder"] if checkpoint else {"offsets": None, "best": None}
+        self._log = MetricsLog(folder.path, offsets=facts["offsets"])
+        self._checkpoints = CheckpointWriter(folder.path)
+        self._policies = folder.path / "policy"
+        self._best: float | None = facts["best"]
+
+    def write(self, kind: str, env_steps: int, values: Metrics) -> None:
+        self._log.write(kind, env_steps, values)
+
+    def save_policy(self, arrays: dict[str, np.ndarray], env_steps: int, return_mean: float) -> None:
+        facts = {"env_steps": env_steps, "return_mean": return_mean}
+        write_array_file(self._policies / "latest.safetensors", "policy", arrays, facts)
+        if self._best is None or return_mean > self._best:
+            self._best = return_mean
+            write_array_file(self._policies / "best.safetensors", "policy", arrays, facts)
+
+    def save_checkpoint(
+        self, env_steps: int, arrays: dict[str, np.ndarray], facts: dict[str, Any], replay: dict[str, np.ndarray]
+    ) -> None:
+        facts = facts | {"recorder": {"offsets": self._log.offsets(), "best": self._best}}
+        self._checkpoints.save(env_steps=env_steps, arrays=arrays, facts=facts, replay=replay)
+
+    def close(self) -> None:
+        self._log.close()
+
+
+def make_agent(config: RunConfig, spec: EnvSpec) -> Agent:
+    """The agent that the config's type names."""
+    if isinstance(config.agent, mbdpg.Config):
+        return mbdpg.MBDPG(config.agent, spec)
+    return td3.TD3(config.agent, spec)
+
+
+def _compose(
+    config: RunConfig,
+    spec: EnvSpec,
+    make: MakeEnvironment,
+    seeds: Sequence[int],
+    recorders: Sequence[_Recorder],
+    stack: contextlib.ExitStack,
+    demonstrations: Demonstrations | None,
+    checkpoint: Checkpoint | None = None,
+) -> Training:
+    """Put a run together, from the beginning or from a checkpoint (then of one seed)."""
+    for recorder in recorders:
+        stack.callback(recorder.close)
+    agent = make_agent(config, spec)
+    collectors = []
+    for seed in seeds:
+        replay = Replay(spec.observation_size, spec.action_size)
+        if checkpoint:
+            replay = Replay.from_columns(checkpoint.replay)
+            replay.demonstrated = checkpoint.facts["demonstrated"]
+        elif demonstrations:
+            replay.extend(demonstrations.replay.columns())
+            replay.demonstrated = replay.size
+        collectors.append(Collector(make, seed, replay, random_steps=config.agent.random_steps))
+        stack.callback(collectors[-1].close)
+    evaluation_env = make()
+    stack.callback(evaluation_env.close)
+    training = Training(
+        Learner(agent, seeds),
+        collectors,
+        evaluation_env,
+        recorders,
+        config.schedule,
+        expert_env_steps=demonstrations.expert_env_steps if demonstrations else 0,
+    )
+    if checkpoint:
+        training.restore(checkpoint.env_steps, [checkpoint.arrays], [checkpoint.facts])
+    return training
+
+
+def _spec_of(make: MakeEnvironment) -> EnvSpec:
+    env = make()
+    env.close()
+    return env.spec
+
+
+def _seed_of(folder: RunFolder) -> int:
+    seed = folder.config.get("seed")
+    require(isinstance(seed, int) and 0 <= seed < 2**31, f"{folder.path} has seed {seed!r} in its config.json")
+    return int(seed)  # type: ignore[arg-type]  # checked above
+
+
+def _settings(kind: type[Any], data: Any, name: str) -> Any:
+    """A config dataclass from JSON, refusing what it does not know and what has another type than its default."""
+    known = {field.name: field.default for field in dataclasses.fields(kind)}
+    require(isinstance(data, dict), f"config.json has no {name}")
+    require(
+        data.keys() == known.keys(),
+        f"config.json does not fit this version of mbdpg: {name} differs in {sorted(data.keys() ^ known.keys())[:5]}",
+    )
+    for key, default in known.items():
+        kinds = (int, type(None)) if default is None else (int, float) if isinstance(default, float) else type(default)
+        require(isinstance(data[key], kinds), f"config.json has {name}.{key} = {str(data[key])[:40]!r}")
+    return kind(**data)
+
+
+def _commit() -> str | None:
+    """The commit of the checkout this package runs from, with a + if it has changes; None elsewhere."""
+    git = ["git", "-C", str(Path(__file__).parent)]
+    try:
+        commit = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5)
+        changes = subprocess.run([*git, "status", "--porcelain", "-uno"], capture_output=True, text=True, timeout=5)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return commit.stdout.strip() + ("+" if changes.stdout.strip() else "") if commit.returncode == 0 else None

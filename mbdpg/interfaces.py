@@ -1,0 +1,181 @@
+"""Words every room uses: what an environment is, what an agent must offer, what a run records.
+
+Axes, in this order wherever they occur: ``seed, batch, time, feature``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+
+Metrics = dict[str, Any]
+"""Names as in docs/metrics.md, to numbers (or, under jit, scalar arrays)."""
+
+
+class UserError(Exception):
+    """Something the person at the keyboard can mend; its text is one line: what was wrong, expected, to do."""
+
+
+def require(condition: bool, message: str) -> None:
+    """Raise `UserError(message)` unless the condition holds."""
+    if not condition:
+        raise UserError(message)
+
+
+def require_settings(config: Any, *, positive: Sequence[str] = (), shares: Sequence[str] = ()) -> None:
+    """Check a config's numbers: those named positive, those named shares in [0, 1], all others at least 0."""
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            continue
+        flag = "--" + field.name.replace("_", "-")
+        if field.name in shares:
+            require(0.0 <= value <= 1.0, f"{flag} is {value}, expected a number from 0 to 1")
+        elif field.name in positive:
+            require(0.0 < value < math.inf, f"{flag} is {value}, expected a number above 0")
+        else:
+            require(0.0 <= value < math.inf, f"{flag} is {value}, expected a number of at least 0")
+
+
+class NonFiniteError(Exception):
+    """The environment returned NaN or an infinity; the transition must not reach the replay."""
+
+
+@dataclass(frozen=True)
+class EnvSpec:
+    """What an environment tells the rest of the system."""
+
+    id: str
+    """Gymnasium id, or a name for an environment made in code."""
+    observation_size: int
+    action_size: int
+    episode_limit: int | None
+    """Steps after which an episode is truncated; None if it never is."""
+    reference_return: float | None
+    """Return at which the task counts as solved (environment steps' undiscounted sum); None if nobody says."""
+
+
+class Step(NamedTuple):
+    """One environment step; `terminated` and `truncated` are never merged."""
+
+    observation: np.ndarray
+    """float32, shape (observation_size,)."""
+    reward: float
+    terminated: bool
+    truncated: bool
+
+
+@runtime_checkable
+class Environment(Protocol):
+    """One environment with actions in [-1, 1] and float32 observations (see `mbdpg.envs.make`)."""
+
+    spec: EnvSpec
+
+    def reset(self, *, seed: int) -> np.ndarray: ...
+
+    def step(self, action: np.ndarray) -> Step: ...
+
+    def render(self) -> np.ndarray: ...
+
+    def close(self) -> None: ...
+
+
+class Batch(NamedTuple):
+    """Windows of consecutive environment steps in raw units, float32; `valid` marks steps inside the episode."""
+
+    observation: Any
+    """Shape (..., batch, time, observation)."""
+    action: Any
+    """Shape (..., batch, time, action), in [-1, 1]."""
+    reward: Any
+    """Shape (..., batch, time)."""
+    next_observation: Any
+    """Shape (..., batch, time, observation)."""
+    terminated: Any
+    """Shape (..., batch, time); 1 where the task ended. A time limit is not an end."""
+    valid: Any
+    """Shape (..., batch, time); 0 before the episode's start and after its end."""
+
+
+class Sampling(NamedTuple):
+    """What an update is fed: `batch_size` windows of `burn_in` past steps, then `length` steps from a drawn one."""
+
+    batch_size: int
+    burn_in: int
+    length: int
+    demonstrated: bool = False
+    """Draw from demonstrations alone."""
+
+
+class Statistics(NamedTuple):
+    """Moments of everything in a replay, and how far learning has come; raw units."""
+
+    observation_mean: Any
+    """Shape (observation,)."""
+    observation_std: Any
+    """Shape (observation,); 1 where an entry never changes."""
+    delta_std: Any
+    """Shape (observation,); standard deviation of the change in one step, 1 where an entry never changes."""
+    reward_std: Any
+    """Of rewards of steps that did not terminate."""
+    terminal_reward_scale: Any
+    """Root mean square of rewards of steps that terminated; 1 if none did."""
+    return_scale: Any
+    """Root mean square of all rewards; the unit of values."""
+    progress: Any
+    """0 while recent training returns are a random policy's, 1 once they reach the reference return."""
+
+
+class Phase(NamedTuple):
+    """One kind of gradient step of an agent, and how often and on what it is taken."""
+
+    name: str
+    """`fitting` or `improving`; `time/<name>` counts its seconds."""
+    updates_per_step: float
+    """Gradient steps per environment step, once `after_steps` have passed."""
+    after_steps: int
+    sampling: Sampling
+    first_updates: int = 0
+    """Gradient steps taken at once when `after_steps` have passed."""
+    update: Callable[..., tuple[Any, Metrics]] = lambda state, batch, *, key: (state, {})
+    """update(state, batch, *, key) -> (state, metrics): pure, for one seed, traced by JAX."""
+
+
+@runtime_checkable
+class Agent(Protocol):
+    """What the training loop knows of an algorithm. States are pytrees of arrays; functions are pure, for one seed."""
+
+    config: Any
+    """Its own Config; every one has `discount` and `random_steps`."""
+    env: EnvSpec
+    phases: Sequence[Phase]
+
+    def init(self, *, key: Any) -> Any:
+        """A fresh state."""
+
+    def prepare(self, state: Any, statistics: Statistics) -> Any:
+        """The state with its scaling (and what follows from progress) set from the replay."""
+
+    def policy(self, state: Any) -> tuple[Any, Any]:
+        """The deterministic policy and its observation normalizer."""
+
+    def exploration_std(self, state: Any) -> Any:
+        """Standard deviation of the Gaussian behavior policy, in units of the action range's half."""
+
+    def diagnose(self, state: Any, batch: Batch, realized_return: Any, *, key: Any) -> Metrics:
+        """Instruments on evaluation episodes that learning has never seen; sampled as `diagnosis` says.
+
+        Args:
+            state: the agent's.
+            batch: windows of evaluation steps, shape (batch, time, ...).
+            realized_return: discounted return that followed each window's first step, NaN where it is not known.
+            key: randomness.
+        """
+
+    @property
+    def diagnosis(self) -> Sampling: ...

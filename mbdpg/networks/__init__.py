@@ -1,0 +1,1 @@
+"""Function approximators and their scaling; they know neither losses nor environments."""

@@ -1,0 +1,1 @@
+"""Run folders in, something to look at out."""

@@ -1,0 +1,42 @@
+"""A video of a policy, with an ffmpeg that comes with the package; no display is needed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import imageio
+import numpy as np
+
+from mbdpg.interfaces import UserError
+
+
+class VideoWriter:
+    """Writes frames to an MP4 file. Use it in a `with` block and call it with every frame."""
+
+    def __init__(self, path: Path, *, frames_per_second: int = 50):
+        """Open `path` for writing.
+
+        Raises:
+            UserError: its ending is not .mp4, or it cannot be written.
+        """
+        if path.suffix != ".mp4":
+            raise UserError(f"the video is to be called {path.name!r}; expected a name that ends in .mp4")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.open("ab").close()
+            self._writer: Any = imageio.get_writer(
+                path, fps=frames_per_second, macro_block_size=2, ffmpeg_log_level="error"
+            )
+        except OSError as error:
+            raise UserError(f"cannot write {path}: {error.strerror or error}") from error
+
+    def __enter__(self) -> VideoWriter:
+        return self
+
+    def __exit__(self, *reason: object) -> None:
+        self._writer.close()
+
+    def __call__(self, frame: np.ndarray) -> None:
+        """Append an RGB frame of shape (height, width, 3), uint8."""
+        self._writer.append_data(frame)

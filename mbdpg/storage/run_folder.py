@@ -1,0 +1,186 @@
+"""The folder that a run leaves behind, and the right to write in it.
+
+::
+
+    RUN/config.json                 what was run, with which versions, on what machine; written first, never changed
+        lock                        who writes here now
+        metrics.jsonl timings.jsonl see metrics
+        tensorboard/                the same for TensorBoard
+        checkpoints/ replay/        see checkpoint
+        policy/                     the exported policy
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import platform
+import socket
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any, final
+
+from mbdpg.interfaces import UserError
+from mbdpg.storage.files import TEMPORARY, DamagedFileError, parse_object, read_checked, sync_folder, write_durably
+
+FORMAT = "mbdpg-run"
+VERSION = 1
+MAX_CONFIG_BYTES = 1 << 20
+
+_CONFIG = "config.json"
+_CONTENTS = (_CONFIG, "lock", "metrics.jsonl", "timings.jsonl", "tensorboard", "checkpoints", "replay", "policy")
+_PACKAGES = ("mbdpg", "jax", "jaxlib", "numpy", "equinox", "optax", "gymnasium", "mujoco", "box2d")
+
+
+@final
+@dataclass(frozen=True)
+class RunFolder:
+    """A run on disk. Make one with `create` or `open`; nothing in it is ever unpickled, evaluated or imported."""
+
+    path: Path
+    config: dict[str, Any]
+    """What `create` was given, as JSON gives it back (tuples are lists)."""
+
+    @classmethod
+    def create(cls, path: Path, config: Mapping[str, Any]) -> RunFolder:
+        """Make the folder and write `config` (JSON) in it; on failure nothing new is left behind.
+
+        Raises:
+            UserError: `path` exists and is not an empty folder, or cannot be made or written.
+            ValueError, TypeError: `config` is over 1 MiB, or not JSON.
+        """
+        data = json.dumps({"format": FORMAT, "version": VERSION, "run": config}, indent=2).encode()
+        if len(data) > MAX_CONFIG_BYTES:
+            raise ValueError(f"the config has {len(data)} bytes, more than the {MAX_CONFIG_BYTES} allowed")
+        with contextlib.ExitStack() as undo:
+            try:
+                for folder in reversed([path, *path.parents]):
+                    if not folder.exists():
+                        folder.mkdir(exist_ok=True)  # runs that start together may share it
+                        undo.callback(_forget, folder.rmdir)
+                _claim(path, data, undo)
+            except OSError as error:
+                raise UserError(f"cannot create {path}: {error.strerror}; choose another --out") from error
+            undo.pop_all()
+        return cls(path, json.loads(data)["run"])
+
+    @classmethod
+    def open(cls, path: Path) -> RunFolder:
+        """Open a folder that `create` made, perhaps on another machine, perhaps by somebody hostile.
+
+        Raises:
+            UserError: it is not there, not a run, damaged, of another version, or its parts are links.
+        """
+        name = path / _CONFIG
+        try:
+            if not path.is_dir():
+                raise UserError(f"{path} is not a folder; expected one that `mbdpg train --out` made")
+            content = parse_object(read_checked(name, limit=MAX_CONFIG_BYTES), name)
+        except DamagedFileError as damage:
+            raise UserError(f"{path} is not a run folder: {damage}") from damage
+        except OSError as error:
+            raise UserError(f"cannot open {path}: {error.strerror}") from error
+        if content.get("format") != FORMAT or not isinstance(content.get("run"), dict):
+            raise UserError(f'{path} is not a run folder: {name} does not have "format": "{FORMAT}" and "run"')
+        if content.get("version") != VERSION:
+            version = str(content.get("version"))[:20]
+            raise UserError(f"{name} has version {version!r}; this mbdpg reads version {VERSION}: use the other mbdpg")
+        for part in _CONTENTS:
+            # A run from a stranger must not make us truncate or delete files elsewhere.
+            if (path / part).is_symlink():
+                raise UserError(f"{path / part} is a link; a run folder holds its own files: copy the target there")
+        return cls(path, content["run"])
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Be the only process that writes in this folder, until the `with` block or the process ends.
+
+        The kernel holds the lock, so one that died, by whatever signal, leaves none behind.
+
+        Raises:
+            UserError: another process holds it (the text has its pid and host), or the folder cannot be locked.
+        """
+        descriptor = _acquire(self.path / "lock")
+        try:
+            yield
+        finally:
+            os.close(descriptor)
+
+
+def describe_machine() -> dict[str, Any]:
+    """Return what decides whether a run can be repeated bit for bit: processor, versions, XLA flags (JSON)."""
+    return {
+        "cpu": _cpu_model(),
+        "cores": os.cpu_count(),
+        "platform": platform.platform(),
+        "python": platform.python_version(),
+        "versions": {package: _version(package) for package in _PACKAGES},
+        "XLA_FLAGS": os.environ.get("XLA_FLAGS"),
+    }
+
+
+def _claim(path: Path, data: bytes, undo: contextlib.ExitStack) -> None:
+    """Write the config into the empty folder `path`; of two processes that try at once, one succeeds at most."""
+    temporary = path / f"{TEMPORARY}{_CONFIG}"
+    try:
+        occupied = next(path.iterdir(), None)
+        if occupied is None:
+            write_durably(temporary, data)
+            undo.callback(_forget, temporary.unlink)
+            # The other process may have begun and ended between the look and the write.
+            occupied = next((other for other in path.iterdir() if other != temporary), None)
+    except FileExistsError:
+        occupied = temporary
+    if occupied is not None:
+        raise UserError(f"{path} is not empty (it has {occupied.name!r}); resume it or choose another --out")
+    os.replace(temporary, path / _CONFIG)
+    undo.callback(_forget, (path / _CONFIG).unlink)
+    sync_folder(path)
+    sync_folder(path.parent)
+
+
+def _forget(remove: Callable[[], object]) -> None:
+    """Call `remove` while another error is on its way, which must not be hidden by a second."""
+    with contextlib.suppress(OSError):
+        remove()
+
+
+def _acquire(lock: Path) -> int:
+    """Return the descriptor whose closing gives the lock back."""
+    try:
+        descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
+    except OSError as error:
+        raise UserError(f"cannot lock {lock}: {error.strerror}; make the folder writable") from error
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        os.ftruncate(descriptor, 0)
+        os.write(descriptor, f"pid {os.getpid()} on host {socket.gethostname()}".encode())
+    except BlockingIOError:
+        holder = os.read(descriptor, 200).decode(errors="replace")
+        os.close(descriptor)
+        known = holder if holder and holder.isprintable() else "another process"
+        raise UserError(f"{lock.parent} is in use by {known}; stop it or choose another --out") from None
+    except OSError as error:
+        os.close(descriptor)
+        raise UserError(f"cannot lock {lock}: {error.strerror}; make room, or use a disk that has locks") from error
+    return descriptor
+
+
+def _cpu_model() -> str:
+    """Return the processor's name; Linux keeps it in /proc, elsewhere Python may know it."""
+    with contextlib.suppress(OSError), open("/proc/cpuinfo", encoding="utf-8") as lines:
+        for line in lines:
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None

@@ -1,0 +1,1 @@
+"""The run, for any agent: collect, learn, evaluate, record."""

@@ -1,0 +1,159 @@
+"""Stepping one seed's environment with the behavior policy into its replay (Algorithm 1, line 5)."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from mbdpg.envs import episode_seed
+from mbdpg.interfaces import Environment, NonFiniteError, UserError
+from mbdpg.training.replay import Replay
+
+FAULTS_IN_A_ROW = 10
+"""So many faults of the environment without one step between them end the run."""
+
+
+def random_stream(seed: int, role: str, counter: int) -> np.random.Generator:
+    """Randomness as a pure function of what it is for, so that no generator's state is ever stored."""
+    return np.random.default_rng([seed, *role.encode(), counter])
+
+
+class Collector:
+    """One environment and everything that stepping it changes.
+
+    An environment that raises or returns NaN loses its episode, never the run: the step is not recorded, what was
+    recorded of the episode is closed as truncated, the environment is made anew and the fault is counted.
+    """
+
+    def __init__(self, make_env: Callable[[], Environment], seed: int, replay: Replay, *, random_steps: int):
+        """Start the first episode; the replay may hold demonstrations already."""
+        self.seed = seed
+        self.replay = replay
+        self.env_steps = 0
+        self.faults = 0
+        self.episode = 0
+        self.returns: list[float] = []
+        self.baseline: float | None = None
+        self._random_steps = random_steps
+        self._make_env = make_env
+        self._env = make_env()
+        self._faults_in_a_row = 0
+        self._return = 0.0
+        self._observation: np.ndarray | None = None
+
+    def collect(self, policy: Callable[[np.ndarray], np.ndarray], std: float, steps: int) -> None:
+        """Record `steps` environment steps, with uniformly random actions during the first `random_steps`."""
+        until = self.env_steps + steps
+        while self.env_steps < until:
+            try:
+                if self._observation is None:
+                    self._observation = self._reset()
+                self._step(self._action(policy, std))
+            except UserError:
+                raise
+            except NonFiniteError as error:
+                self._recover(error)
+            except Exception as error:  # whatever an environment raises
+                self._recover(error)
+        if self.baseline is None and self.env_steps >= self._random_steps:
+            self.baseline = float(np.mean(self.returns)) if self.returns else self._return
+
+    def progress(self, reference_return: float | None) -> float:
+        """How far the last ten training returns are on the way from a random policy's to the reference, in [0, 1]."""
+        if reference_return is None or self.baseline is None or not self.returns:
+            return 0.0
+        recent = float(np.mean(self.returns[-10:]))
+        span = max(reference_return - self.baseline, 1e-6)
+        return float(np.clip((recent - self.baseline) / span, 0.0, 1.0))
+
+    def facts(self) -> dict[str, Any]:
+        """What a checkpoint must hold beside the replay."""
+        return {
+            "env_steps": self.env_steps,
+            "faults": self.faults,
+            "episode": self.episode,
+            "returns": self.returns,
+            "baseline": self.baseline,
+            "faults_in_a_row": self._faults_in_a_row,
+            "return": self._return,
+        }
+
+    def restore(self, facts: Mapping[str, Any]) -> None:
+        """Put back what `facts` gave, and play the open episode again up to where it was.
+
+        An environment that does not repeat itself loses that episode, and the run says that it is no longer exact.
+        """
+        self.env_steps, self.faults, self.episode = facts["env_steps"], facts["faults"], facts["episode"]
+        self.returns, self.baseline = list(facts["returns"]), facts["baseline"]
+        self._faults_in_a_row, self._return = facts["faults_in_a_row"], facts["return"]
+        observations, actions, after = self.replay.open_episode()
+        if len(actions) == 0:
+            return
+        observation = self._reset()
+        exact = np.array_equal(observation, observations[0])
+        for action, expected in zip(actions, after, strict=True):
+            if not exact:
+                break
+            observation = self._env.step(action).observation
+            exact = np.array_equal(observation, expected)
+        if exact:
+            self._observation = observation
+            return
+        print(
+            f"mbdpg: {self._env.spec.id} did not repeat its open episode, so this resume is not exact: "
+            "that episode is closed and a new one begins",
+            file=sys.stderr,
+        )
+        self._end_episode()
+        self.replay.close_episode()
+
+    def close(self) -> None:
+        """Close the environment."""
+        self._env.close()
+
+    def _action(self, policy: Callable[[np.ndarray], np.ndarray], std: float) -> np.ndarray:
+        size = self._env.spec.action_size
+        noise = random_stream(self.seed, "act", self.env_steps)
+        if self.env_steps < self._random_steps:
+            return noise.uniform(-1.0, 1.0, size).astype(np.float32)
+        assert self._observation is not None
+        action = policy(self._observation) + std * noise.standard_normal(size)
+        return np.clip(action, -1.0, 1.0).astype(np.float32)
+
+    def _step(self, action: np.ndarray) -> None:
+        assert self._observation is not None
+        step = self._env.step(action)
+        self.replay.add(self._observation, action, step.reward, step.observation, step.terminated, step.truncated)
+        self.env_steps += 1
+        self._faults_in_a_row = 0
+        self._return += float(step.reward)
+        self._observation = step.observation
+        if step.terminated or step.truncated:
+            self.returns.append(self._return)
+            self._end_episode()
+
+    def _reset(self) -> np.ndarray:
+        return self._env.reset(seed=episode_seed(self.seed, "train", self.episode))
+
+    def _end_episode(self) -> None:
+        self.episode += 1
+        self._return = 0.0
+        self._observation = None
+
+    def _recover(self, error: Exception) -> None:
+        self.faults += 1
+        self._faults_in_a_row += 1
+        what = f"{type(error).__name__}: {error}".splitlines()[0]
+        if self._faults_in_a_row >= FAULTS_IN_A_ROW:
+            raise UserError(
+                f"{self._env.spec.id} failed {FAULTS_IN_A_ROW} times in a row ({what}); mend the environment, "
+                "then continue with mbdpg resume"
+            ) from error
+        print(f"mbdpg: episode {self.episode} dropped, the environment failed ({what})", file=sys.stderr)
+        self.replay.close_episode()
+        self._end_episode()
+        self._env.close()
+        self._env = self._make_env()

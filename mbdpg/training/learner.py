@@ -1,0 +1,120 @@
+"""An agent's state for several seeds at once: compiled updates, host copies of the policies, and exact snapshots."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mbdpg.interfaces import Agent, Batch, Metrics, Phase, Statistics, UserError
+from mbdpg.networks.policy import NumpyPolicy, policy_arrays
+
+
+class Learner:
+    """Holds the states of all seeds along a leading `seed` axis and runs k gradient steps per call."""
+
+    def __init__(self, agent: Agent, seeds: Sequence[int]):
+        """Initialize every seed's state from its own key."""
+        self.agent = agent
+        self._keys = jax.vmap(jax.random.key)(jnp.asarray(seeds, jnp.uint32))
+        init_keys = jax.vmap(jax.random.fold_in, (0, None))(self._keys, 0)
+        self.state = jax.jit(over_seeds(lambda key: agent.init(key=key)))(init_keys)
+        self._prepare = jax.jit(over_seeds(agent.prepare))
+        self._std = jax.jit(jax.vmap(agent.exploration_std))
+        self._diagnose = jax.jit(over_seeds(lambda s, b, r, k: agent.diagnose(s, b, r, key=k)))
+        self._updates = {phase.name: _compile(phase) for phase in agent.phases}
+
+    def prepare(self, statistics: Sequence[Statistics]) -> None:
+        """Set each seed's scaling."""
+        self.state = self._prepare(self.state, _stack(statistics))
+
+    def update(self, phase: Phase, batches: Sequence[Batch], done: int) -> Metrics:
+        """Take the gradient steps that `batches` hold, (updates, batch, ...) for each seed.
+
+        Returns:
+            Means over the steps, one array of shape (seed,) per metric.
+        """
+        keys = jax.vmap(jax.random.fold_in, (0, None))(self._keys, 1 + self.agent.phases.index(phase))
+        self.state, metrics = self._updates[phase.name](self.state, _stack(batches), keys, jnp.uint32(done))
+        return {name: np.asarray(value) for name, value in metrics.items()}
+
+    def diagnose(self, batches: Sequence[Batch], realized: Sequence[np.ndarray], env_steps: int) -> Metrics:
+        """The agent's instruments, one array of shape (seed,) per metric."""
+        keys = jax.vmap(jax.random.fold_in, (0, None))(self._keys, jnp.uint32(2**31 + env_steps))
+        metrics = self._diagnose(self.state, _stack(batches), np.stack(realized), keys)
+        return {name: np.asarray(value) for name, value in metrics.items()}
+
+    def policies(self) -> list[dict[str, np.ndarray]]:
+        """Each seed's policy as named arrays."""
+        policy, normalizer = jax.device_get(self.agent.policy(self.state))
+        return [policy_arrays(*jax.tree.map(lambda x, i=i: x[i], (policy, normalizer))) for i in range(len(self._keys))]
+
+    def actors(self) -> tuple[list[NumpyPolicy], np.ndarray]:
+        """Each seed's policy for acting, and the standard deviations of the behavior policies."""
+        return [NumpyPolicy(arrays) for arrays in self.policies()], np.asarray(self._std(self.state))
+
+    def snapshot(self, index: int) -> dict[str, np.ndarray]:
+        """One seed's whole state as named arrays."""
+        leaves = jax.tree_util.tree_leaves_with_path(self.state)
+        return {_name(path): np.asarray(leaf[index]) for path, leaf in leaves}
+
+    def restore(self, snapshots: Sequence[Mapping[str, np.ndarray]]) -> None:
+        """Put back what `snapshot` gave, for every seed.
+
+        Raises:
+            UserError: an array is missing, or has another shape or type than this configuration's.
+        """
+
+        def put(path: Any, leaf: jax.Array) -> jax.Array:
+            name, arrays = _name(path), []
+            for snapshot in snapshots:
+                found = snapshot.get(name)
+                if found is None or found.shape != leaf.shape[1:] or found.dtype != leaf.dtype:
+                    have = "nothing" if found is None else f"{found.dtype}{list(found.shape)}"
+                    raise UserError(
+                        f"the checkpoint does not fit this configuration: {name} is {have}, "
+                        f"expected {leaf.dtype}{list(leaf.shape[1:])}"
+                    )
+                arrays.append(found)
+            return jnp.asarray(np.stack(arrays))
+
+        self.state = jax.tree_util.tree_map_with_path(put, self.state)
+
+
+def over_seeds(function: Any) -> Any:
+    """Map a one-seed function over leading seed axes.
+
+    On CPU one seed after the other, which computes for each exactly what it would alone; elsewhere all at once.
+    """
+    if jax.default_backend() != "cpu":
+        return jax.vmap(function)
+    return lambda *args: jax.lax.map(lambda packed: function(*packed), args)
+
+
+def _compile(phase: Phase) -> Any:
+    def many(state: Any, batches: Batch, key: Any, done: Any) -> tuple[Any, Metrics]:
+        def one(carry: Any, inputs: tuple[Any, Batch]) -> tuple[Any, Metrics]:
+            step, batch = inputs
+            return phase.update(carry, batch, key=jax.random.fold_in(key, step))
+
+        steps = done + jnp.arange(batches.reward.shape[0], dtype=jnp.uint32)
+        state, metrics = jax.lax.scan(one, state, (steps, batches))
+        return state, jax.tree.map(lambda x: jnp.mean(x.astype(jnp.float32)), metrics)
+
+    def seeds(state: Any, batches: Batch, keys: Any, done: Any) -> tuple[Any, Metrics]:
+        return over_seeds(lambda s, b, k: many(s, b, k, done))(state, batches, keys)
+
+    return jax.jit(seeds, donate_argnums=0)
+
+
+def _stack(items: Sequence[Any]) -> Any:
+    """Join one pytree per seed along a new leading axis."""
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *items)
+
+
+def _name(path: Any) -> str:
+    """A state leaf's name, as in `actor/mlp/hidden/0/weight`."""
+    return "/".join(str(getattr(key, "name", getattr(key, "idx", getattr(key, "key", key)))) for key in path)
