@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -52,6 +52,7 @@ class Update(NamedTuple):
     """One per seed, when there was one."""
 
 
+@runtime_checkable
 class Recorder(Protocol):
     """Where one seed's run is written."""
 

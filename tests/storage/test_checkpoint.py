@@ -358,11 +358,20 @@ def die_at_random_times(folder: Path, deaths: int) -> int:
     return last
 
 
+WITHOUT_JAX = f"""
+import pathlib, sys, types
+sys.modules["mbdpg"] = types.ModuleType("mbdpg")  # not mbdpg/__init__.py, which imports JAX
+sys.modules["mbdpg"].__path__ = [{str(ROOT / "mbdpg")!r}]
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+import test_checkpoint
+assert "jax" not in sys.modules
+"""
+
+
 def in_own_process(call: str, folder: Path) -> str:
     """Call one of this file's functions where forking is safe: in a process without JAX and its threads."""
-    code = f"import pathlib, test_checkpoint as t; print(t.{call.format(folder=f'pathlib.Path({str(folder)!r})')})"
-    environment = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{Path(__file__).parent}"}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
+    code = f"{WITHOUT_JAX}print(test_checkpoint.{call.format(folder=f'pathlib.Path({str(folder)!r})')})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     return done.stdout.strip()
