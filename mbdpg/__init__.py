@@ -2,14 +2,10 @@
 
 from mbdpg.agents.mbdpg import Config as MBDPGConfig
 from mbdpg.agents.td3 import Config as TD3Config
-from mbdpg.api import evaluate as evaluate
-from mbdpg.api import load_policy as load_policy
-from mbdpg.api import resume as resume
-from mbdpg.api import train as train
+from mbdpg.api import evaluate as evaluate, load_policy as load_policy, resume as resume, train as train
 from mbdpg.interfaces import UserError as UserError
 from mbdpg.training.evaluation import Evaluation as Evaluation
-from mbdpg.training.loop import Schedule as Schedule
-from mbdpg.training.loop import Update as Update
+from mbdpg.training.loop import Schedule as Schedule, Update as Update
 
 __version__ = "0.1.0"
 __all__ = [

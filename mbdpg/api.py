@@ -13,8 +13,7 @@ from mbdpg.agents import mbdpg, td3
 from mbdpg.experiments import run
 from mbdpg.interfaces import Environment
 from mbdpg.networks.policy import NumpyPolicy
-from mbdpg.training.evaluation import Evaluation
-from mbdpg.training.evaluation import evaluate as run_episodes
+from mbdpg.training.evaluation import Evaluation, evaluate as run_episodes
 from mbdpg.training.loop import Schedule, Update
 
 Env = str | Callable[[], gymnasium.Env]

@@ -22,7 +22,8 @@ from mbdpg import envs
 from mbdpg.experiments import presets
 from mbdpg.experiments.run import EnvOptions, RunConfig, load_policy, resume, train
 from mbdpg.imitation.demonstrations import record
-from mbdpg.interfaces import UserError, require
+from mbdpg.interfaces import Environment, UserError, require
+from mbdpg.networks.policy import NumpyPolicy
 from mbdpg.reports.console import RunDisplay
 from mbdpg.reports.curves import draw_curves
 from mbdpg.reports.video import VideoWriter
@@ -69,6 +70,8 @@ class Resume:
     """Run folder, or a folder of run folders."""
     steps: int | None = None
     """Environment steps of the whole run, to make it longer than planned."""
+    allow_import: bool = False
+    """Allow the run's environment id to import code (module:Id)."""
     debug: bool = False
     """Show the traceback of an error."""
 
@@ -131,6 +134,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         require(args[0] in verbs, f"there is no verb {args[0]!r}; expected one of {', '.join(verbs)}")
         verbs[args[0]](args[1:])
+    except KeyboardInterrupt:
+        sys.exit(130)
     except UserError as error:
         if "--debug" in args:
             raise
@@ -195,6 +200,7 @@ def _resume(flags: Resume) -> None:
                 resume(
                     run,
                     steps=flags.steps,
+                    allow_import=flags.allow_import,
                     on_start=start,
                     on_update=lambda update, display=display: display[0](update),
                     should_stop=should_stop,
@@ -213,11 +219,7 @@ def _evaluate(flags: Evaluate) -> None:
     policy = load_policy(flags.run, best=flags.best)
     seeds = [envs.episode_seed(flags.seed, "video", i) for i in range(flags.episodes)]
     env = dataclasses.replace(config, env_options=options).make_env(render=flags.video is not None)
-    sizes = (env.spec.observation_size, env.spec.action_size)
-    require(
-        (policy.observation_size, policy.action_size) == sizes,
-        f"the policy of {flags.run} has sizes {(policy.observation_size, policy.action_size)}, {config.env} has {sizes}",
-    )
+    _check_sizes(policy, flags.run, env)
     returns, lengths = [], []
     for episode, seed in enumerate(seeds):
         with contextlib.ExitStack() as stack:
@@ -227,8 +229,10 @@ def _evaluate(flags: Evaluate) -> None:
             outcome = evaluate(env, policy, [seed], on_frame=film)
         returns += outcome.returns
         lengths += outcome.lengths
-        print(f"episode {episode}: return {outcome.returns[0]:.1f}, {outcome.lengths[0]} steps")
+        if outcome.returns:
+            print(f"episode {episode}: return {outcome.returns[0]:.1f}, {outcome.lengths[0]} steps")
     env.close()
+    require(len(returns) > 0, f"{config.env} failed in every episode (see above): mend it, then evaluate again")
     print(
         f"{len(returns)} episodes: return {np.mean(returns):.1f} ± {np.std(returns):.1f}, {np.mean(lengths):.0f} steps"
     )
@@ -253,6 +257,7 @@ def _demonstrate(flags: Demonstrate) -> None:
             _stopped(should_stop, run, f"then mbdpg demonstrate {flags.env} --out {flags.out} --expert {run}")
     expert_steps = _steps_learned(run)
     policy = load_policy(run, best=True)
+    _check_sizes(policy, run, env)
     found = record(
         env,
         policy,
@@ -267,6 +272,15 @@ def _demonstrate(flags: Demonstrate) -> None:
     print(
         f"{len(returns)} successful episodes of {found.facts['tried']} (mean return {np.mean(returns):.1f}) in {flags.out}; "
         f"they cost {found.expert_env_steps} environment steps"
+    )
+
+
+def _check_sizes(policy: NumpyPolicy, run: Path, env: Environment) -> None:
+    found, wanted = (policy.observation_size, policy.action_size), (env.spec.observation_size, env.spec.action_size)
+    require(
+        found == wanted,
+        f"the policy of {run} has {found[0]} observation and {found[1]} action entries, but {env.spec.id} has "
+        f"{wanted[0]} and {wanted[1]}; expected a run of {env.spec.id}",
     )
 
 
@@ -306,12 +320,13 @@ def _one_line(text: str) -> str:
 
 def _peek(args: Sequence[str], flag: str) -> str | None:
     """A flag's value before the rest can be parsed, because the rest depends on it."""
+    found = None
     for position, arg in enumerate(args):
         if arg == f"--{flag}" and position + 1 < len(args):
-            return args[position + 1]
-        if arg.startswith(f"--{flag}="):
-            return arg.split("=", 1)[1]
-    return None
+            found = args[position + 1]  # of several the last holds, as for the other flags
+        elif arg.startswith(f"--{flag}="):
+            found = arg.split("=", 1)[1]
+    return found
 
 
 @contextlib.contextmanager

@@ -9,6 +9,8 @@ os.environ.setdefault("MPLBACKEND", "agg")
 for library in ("OMP", "OPENBLAS", "MKL"):  # pytest-xdist already uses every core
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
+os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")  # compiling is most of what small networks cost
+
 from jaxtyping import install_import_hook
 
 # Before any test imports mbdpg. The "tower": as for mypy, an int is a float.

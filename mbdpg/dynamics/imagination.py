@@ -11,7 +11,6 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from mbdpg.dynamics.mixture import Memory, MixtureDynamics, Scales, next_observation
 
-
 UNROLLED = 5
 """Steps per iteration of the compiled loop: XLA on CPU copies what a loop carries, and fuses nothing across it."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from typing import Any, final
 
@@ -14,6 +13,9 @@ from mbdpg.interfaces import EnvSpec, NonFiniteError, Step, UserError
 
 EXTRAS = {"box2d": "box2d", "mujoco": "mujoco", "classic_control": "classic-control"}
 """Folder of gymnasium.envs, to the extra of the pip package that its environments need."""
+
+LARGEST = float(np.finfo(np.float32).max)
+"""A reward beyond it would be an infinity to the agents."""
 
 
 @final
@@ -55,13 +57,13 @@ class GymnasiumEnvironment:
 
         Raises:
             ValueError: the action has another shape, a NaN or an infinity; the environment was not stepped.
-            NonFiniteError: the observation or the reward has a NaN or an infinity.
+            NonFiniteError: the observation or the reward has a NaN or, as float32, an infinity.
             UserError: the observation has not the shape that the environment promised.
         """
         observation, reward, terminated, truncated, _ = self._env.step(self._real_action(action))
         observation = self._checked(observation)
         reward = float(reward)
-        if not math.isfinite(reward):
+        if not abs(reward) <= LARGEST:
             raise NonFiniteError(f"{self.spec.id} returned the reward {reward}")
         return Step(observation, reward, bool(terminated), bool(truncated))
 

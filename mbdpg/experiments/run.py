@@ -115,14 +115,15 @@ def train(
     spec = _spec_of(make)
     demonstrations = Demonstrations.load(Path(config.demonstrations), spec) if config.demonstrations else None
     description = dataclasses.asdict(config) | {"commit": _commit(), "machine": describe_machine()}
-    with contextlib.ExitStack() as stack:
-        folders = []
+    folders: list[RunFolder] = []
+    with contextlib.ExitStack() as undo, contextlib.ExitStack() as stack:
         for seed in seeds:
             facts = {"seed": seed, "custom_env": make_env is not None}
-            folders.append(RunFolder.create(out / f"seed-{seed}", description | facts))
+            folders.append(RunFolder.create(out / f"seed-{seed}", description | facts, undo=undo))
             stack.enter_context(folders[-1].locked())
         training = _compose(config, spec, make, seeds, [_Recorder(folder) for folder in folders], stack, demonstrations)
         training.save()
+        undo.pop_all()  # from here on, there is something to go on from
         training.run(on_update, should_stop)
     return [folder.path for folder in folders]
 
@@ -132,6 +133,7 @@ def resume(
     *,
     make_env: MakeEnvironment | None = None,
     steps: int | None = None,
+    allow_import: bool = False,
     on_start: Callable[[RunConfig, int], None] = lambda config, env_steps: None,
     on_update: OnUpdate = lambda update: None,
     should_stop: Callable[[], bool] = lambda: False,
@@ -142,6 +144,7 @@ def resume(
         path: the run folder.
         make_env: as for `train`; needed if the run was given one.
         steps: environment steps of the whole run, if it shall be longer than it was meant to be.
+        allow_import: allow an id of the form module:Id, whatever the folder says: it may come from a stranger.
         on_start: called with the run's config and the step it goes on from.
         on_update: as for `train`.
         should_stop: as for `train`.
@@ -151,6 +154,7 @@ def resume(
     """
     folder = RunFolder.open(path)
     config = RunConfig.from_json(folder.config)
+    config = dataclasses.replace(config, env_options=dataclasses.replace(config.env_options, allow_import=allow_import))
     if steps is not None:
         require(steps >= config.schedule.steps, f"--steps is {steps}, less than the run's own {config.schedule.steps}")
         config = dataclasses.replace(config, schedule=dataclasses.replace(config.schedule, steps=steps))
@@ -198,7 +202,7 @@ class _Recorder:
     def save_policy(self, arrays: dict[str, np.ndarray], env_steps: int, return_mean: float) -> None:
         facts = {"env_steps": env_steps, "return_mean": return_mean}
         write_array_file(self._policies / "latest.safetensors", "policy", arrays, facts)
-        if self._best is None or return_mean > self._best:
+        if np.isfinite(return_mean) and (self._best is None or return_mean > self._best):
             self._best = return_mean
             write_array_file(self._policies / "best.safetensors", "policy", arrays, facts)
 
@@ -214,9 +218,7 @@ class _Recorder:
 
 def make_agent(config: RunConfig, spec: EnvSpec) -> Agent:
     """The agent that the config's type names."""
-    if isinstance(config.agent, mbdpg.Config):
-        return mbdpg.MBDPG(config.agent, spec)
-    return td3.TD3(config.agent, spec)
+    return mbdpg.MBDPG(config.agent, spec) if isinstance(config.agent, mbdpg.Config) else td3.TD3(config.agent, spec)
 
 
 def _compose(

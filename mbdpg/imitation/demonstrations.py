@@ -83,6 +83,8 @@ def record(
         outcome = evaluate(env, policy, [episode_seed(seed, "expert", tried)])
         tried += 1
         expert_env_steps += outcome.steps.size
+        if not outcome.returns:
+            continue  # the environment failed
         best = max(best, outcome.returns[0])
         if outcome.returns[0] >= success_return:
             kept.extend(outcome.steps.columns())

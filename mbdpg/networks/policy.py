@@ -88,6 +88,8 @@ class NumpyPolicy:
         for name, value in self.arrays.items():
             if not np.isfinite(value).all():
                 raise ValueError(f"the policy's array {name} is not finite")
+        if not (self._std > 0).all():
+            raise ValueError("the policy's array std is not positive")
 
 
 def policy_arrays(policy: Policy, normalizer: Normalizer) -> dict[str, np.ndarray]:

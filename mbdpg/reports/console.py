@@ -43,7 +43,8 @@ class RunDisplay:
         self._done = update.env_steps
         evaluated = update.evaluation is not None
         if evaluated:
-            self._evaluation = f"{np.mean([np.mean(e.returns) for e in update.evaluation]):.1f}"
+            returns = [value for evaluation in update.evaluation for value in evaluation.returns]
+            self._evaluation = f"{np.mean(returns):.1f}" if returns else "-"
         text = self._text(update.train_returns)
         if self._bar is not None:
             self._bar.update(self._task, completed=self._done, description=text)

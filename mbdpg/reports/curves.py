@@ -9,10 +9,10 @@ import matplotlib
 import numpy as np
 
 matplotlib.use("Agg")  # no display is ever needed
-from matplotlib import pyplot as plt  # noqa: E402 - the backend is chosen before
+from matplotlib import pyplot as plt
 
-from mbdpg.interfaces import UserError  # noqa: E402
-from mbdpg.storage.metrics import read_metrics  # noqa: E402
+from mbdpg.interfaces import UserError
+from mbdpg.storage.metrics import read_metrics
 
 
 def draw_curves(groups: Mapping[str, Sequence[Path]], path: Path, *, title: str) -> None:
@@ -26,24 +26,19 @@ def draw_curves(groups: Mapping[str, Sequence[Path]], path: Path, *, title: str)
     Raises:
         UserError: no run has an evaluation yet, or the picture cannot be written.
     """
+    known = {label: [curve for curve in map(_curve, runs) if curve] for label, runs in groups.items()}
+    if not any(known.values()):
+        raise UserError("no run has an evaluation yet; train until the first one, then draw again")
     figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
-    drawn = False
-    for number, (label, runs) in enumerate(groups.items()):
-        curves = [read_metrics(run, "eval") for run in runs]
-        curves = [curve for curve in curves if curve["env_steps"]]
+    for number, (label, curves) in enumerate(known.items()):
         if not curves:
             continue
-        drawn = True
         for curve in curves:
-            axes.plot(curve["env_steps"], curve["eval/return_mean"], color=f"C{number}", alpha=0.35, linewidth=1)
-        shared = sorted(set.intersection(*(set(curve["env_steps"]) for curve in curves)))
-        at = [dict(zip(curve["env_steps"], curve["eval/return_mean"], strict=True)) for curve in curves]
-        mean = [np.mean([run[step] for run in at]) for step in shared]
+            axes.plot(list(curve), list(curve.values()), color=f"C{number}", alpha=0.35, linewidth=1)
+        shared = sorted(set.intersection(*map(set, curves)))
+        mean = [np.mean([curve[step] for curve in curves]) for step in shared]
         seeds = f"{len(curves)} seed{'s' * (len(curves) > 1)}"
         axes.plot(shared, mean, color=f"C{number}", linewidth=2, label=f"{label} ({seeds})")
-    if not drawn:
-        plt.close(figure)
-        raise UserError("no run has an evaluation yet; train until the first one, then draw again")
     axes.set(xlabel="environment steps", ylabel="evaluation return", title=title)
     axes.grid(alpha=0.3)
     axes.legend()
@@ -53,3 +48,10 @@ def draw_curves(groups: Mapping[str, Sequence[Path]], path: Path, *, title: str)
         raise UserError(f"cannot write {path}: {error.strerror}") from error
     finally:
         plt.close(figure)
+
+
+def _curve(run: Path) -> dict[int, float]:
+    """Mean return by environment steps, without evaluations in which every episode failed."""
+    rows = read_metrics(run, "eval")
+    pairs = zip(rows["env_steps"], rows.get("eval/return_mean", []), strict=True)
+    return {step: value for step, value in pairs if value is not None}

@@ -17,6 +17,7 @@ import fcntl
 import json
 import os
 import platform
+import shutil
 import socket
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -46,8 +47,10 @@ class RunFolder:
     """What `create` was given, as JSON gives it back (tuples are lists)."""
 
     @classmethod
-    def create(cls, path: Path, config: Mapping[str, Any]) -> RunFolder:
+    def create(cls, path: Path, config: Mapping[str, Any], *, undo: contextlib.ExitStack | None = None) -> RunFolder:
         """Make the folder and write `config` (JSON) in it; on failure nothing new is left behind.
+
+        Nor when `undo` is closed: it deletes the folder, whatever is in it by then.
 
         Raises:
             UserError: `path` exists and is not an empty folder, or cannot be made or written.
@@ -56,16 +59,19 @@ class RunFolder:
         data = json.dumps({"format": FORMAT, "version": VERSION, "run": config}, indent=2).encode()
         if len(data) > MAX_CONFIG_BYTES:
             raise ValueError(f"the config has {len(data)} bytes, more than the {MAX_CONFIG_BYTES} allowed")
-        with contextlib.ExitStack() as undo:
+        with contextlib.ExitStack() as made:
             try:
                 for folder in reversed([path, *path.parents]):
                     if not folder.exists():
                         folder.mkdir(exist_ok=True)  # runs that start together may share it
-                        undo.callback(_forget, folder.rmdir)
-                _claim(path, data, undo)
+                        made.callback(_forget, folder.rmdir)
+                _claim(path, data, made)
             except OSError as error:
                 raise UserError(f"cannot create {path}: {error.strerror}; choose another --out") from error
-            undo.pop_all()
+            kept = made.pop_all()
+        if undo is not None:
+            undo.push(kept)
+            undo.callback(shutil.rmtree, path, ignore_errors=True)
         return cls(path, json.loads(data)["run"])
 
     @classmethod

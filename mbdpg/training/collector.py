@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -40,6 +41,7 @@ class Collector:
         self._random_steps = random_steps
         self._make_env = make_env
         self._env = make_env()
+        self._broken = False
         self._faults_in_a_row = 0
         self._return = 0.0
         self._observation: np.ndarray | None = None
@@ -92,15 +94,7 @@ class Collector:
         observations, actions, after = self.replay.open_episode()
         if len(actions) == 0:
             return
-        observation = self._reset()
-        exact = np.array_equal(observation, observations[0])
-        for action, expected in zip(actions, after, strict=True):
-            if not exact:
-                break
-            observation = self._env.step(action).observation
-            exact = np.array_equal(observation, expected)
-        if exact:
-            self._observation = observation
+        if self._repeat(observations[0], actions, after):
             return
         print(
             f"mbdpg: {self._env.spec.id} did not repeat its open episode, so this resume is not exact: "
@@ -109,6 +103,23 @@ class Collector:
         )
         self._end_episode()
         self.replay.close_episode()
+
+    def _repeat(self, first: np.ndarray, actions: np.ndarray, after: np.ndarray) -> bool:
+        """Play an episode again from its seed; False, in no episode, if anything came out differently."""
+        try:
+            observation = self._reset()
+            exact = np.array_equal(observation, first)
+            for action, expected in zip(actions, after, strict=True):
+                if not exact:
+                    return False
+                observation = self._env.step(action).observation
+                exact = np.array_equal(observation, expected)
+        except UserError:
+            raise
+        except Exception:  # whatever an environment raises: it did not then
+            self._broken, exact = True, False
+        self._observation = observation if exact else None
+        return exact
 
     def close(self) -> None:
         """Close the environment."""
@@ -136,6 +147,11 @@ class Collector:
             self._end_episode()
 
     def _reset(self) -> np.ndarray:
+        if self._broken:
+            with contextlib.suppress(Exception):  # it is broken
+                self._env.close()
+            self._env = self._make_env()
+            self._broken = False
         return self._env.reset(seed=episode_seed(self.seed, "train", self.episode))
 
     def _end_episode(self) -> None:
@@ -155,5 +171,4 @@ class Collector:
         print(f"mbdpg: episode {self.episode} dropped, the environment failed ({what})", file=sys.stderr)
         self.replay.close_episode()
         self._end_episode()
-        self._env.close()
-        self._env = self._make_env()
+        self._broken = True

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from mbdpg.interfaces import Batch, Environment, Sampling
+from mbdpg.interfaces import Batch, Environment, Sampling, UserError
 from mbdpg.training.replay import Replay
 
 TAIL = 300
@@ -15,14 +17,20 @@ TAIL = 300
 
 
 class Evaluation(NamedTuple):
-    """Some episodes."""
+    """Some episodes, but for those that the environment did not bring to an end."""
 
     returns: list[float]
     """Undiscounted, one per episode."""
     lengths: list[int]
     """Environment steps, one per episode."""
     steps: Replay
-    """All their steps."""
+    """All their steps, and those before a fault."""
+    faults: int = 0
+    """Episodes dropped, because the environment raised or returned NaN."""
+
+
+class EnvironmentFailedError(Exception):
+    """Whatever an environment raised, told apart from what a policy or a video raises."""
 
 
 def evaluate(
@@ -33,6 +41,8 @@ def evaluate(
 ) -> Evaluation:
     """Run one episode per environment seed, without noise.
 
+    An episode in which the environment raises or returns NaN is dropped, counted, and said on stderr.
+
     Args:
         env: a fresh or used environment.
         policy: actions in [-1, 1] from raw observations.
@@ -40,23 +50,50 @@ def evaluate(
         on_frame: called with an RGB image before every step, if given.
 
     Raises:
-        NonFiniteError: the environment returned NaN or an infinity.
+        UserError: the environment does not keep what its spaces promise.
     """
     steps = Replay(env.spec.observation_size, env.spec.action_size)
-    returns, lengths = [], []
+    returns, lengths, faults = [], [], 0
     for seed in seeds:
-        observation, total, length, over = env.reset(seed=seed), 0.0, 0, False
-        while not over:
-            if on_frame is not None:
-                on_frame(env.render())
-            action = np.asarray(policy(observation), np.float32)
-            step = env.step(action)
-            steps.add(observation, action, step.reward, step.observation, step.terminated, step.truncated)
-            observation, over = step.observation, step.terminated or step.truncated
-            total, length = total + float(step.reward), length + 1
+        try:
+            total, length = _episode(env, policy, seed, steps, on_frame)
+        except EnvironmentFailedError as fault:
+            faults += 1
+            steps.close_episode()
+            print(f"mbdpg: evaluation episode dropped, {env.spec.id} failed ({fault})", file=sys.stderr)
+            continue
         returns.append(total)
         lengths.append(length)
-    return Evaluation(returns, lengths, steps)
+    return Evaluation(returns, lengths, steps, faults)
+
+
+def _episode(
+    env: Environment,
+    policy: Callable[[np.ndarray], np.ndarray],
+    seed: int,
+    steps: Replay,
+    on_frame: Callable[[np.ndarray], None] | None,
+) -> tuple[float, int]:
+    """Append one episode to `steps`; return its return and length."""
+    observation, total, length, over = _guarded(partial(env.reset, seed=seed)), 0.0, 0, False
+    while not over:
+        if on_frame is not None:
+            on_frame(env.render())
+        action = np.asarray(policy(observation), np.float32)
+        step = _guarded(partial(env.step, action))
+        steps.add(observation, action, step.reward, step.observation, step.terminated, step.truncated)
+        observation, over = step.observation, step.terminated or step.truncated
+        total, length = total + float(step.reward), length + 1
+    return total, length
+
+
+def _guarded(call: Callable[[], Any]) -> Any:
+    try:
+        return call()
+    except UserError:
+        raise
+    except Exception as error:
+        raise EnvironmentFailedError(" ".join(f"{type(error).__name__}: {error}".split())) from error
 
 
 def realized_returns(steps: Replay, discount: float) -> np.ndarray:

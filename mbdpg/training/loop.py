@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from mbdpg.envs import episode_seed
-from mbdpg.interfaces import Environment, EnvSpec, Metrics, Phase, require
+from mbdpg.interfaces import Environment, Metrics, Phase, require
 from mbdpg.networks.policy import NumpyPolicy
 from mbdpg.training.collector import Collector, random_stream
 from mbdpg.training.evaluation import Evaluation, diagnosis_windows, evaluate
@@ -156,7 +157,7 @@ class Training:
     def _learn(self, should_stop: Callable[[], bool]) -> bool:
         """Take all updates that are due (Algorithm 1, lines 3 and 6-16); False if asked to stop before the last."""
         agent = self.learner.agent
-        if self.env_steps < agent.config.random_steps:
+        if self.env_steps < agent.config.random_steps or not all(c.replay.size for c in self.collectors):
             return True
         progress = [c.progress(agent.env.reference_return) for c in self.collectors]
         self.learner.prepare([c.replay.statistics(p) for c, p in zip(self.collectors, progress, strict=True)])
@@ -164,11 +165,14 @@ class Training:
 
     def _take(self, phase: Phase, should_stop: Callable[[], bool]) -> bool:
         """Take a phase's updates that are due, always as many per call, so that it is compiled once."""
+        if self.env_steps < phase.after_steps:
+            return True
         if phase.sampling.demonstrated and not self.collectors[0].replay.demonstrated:
             return True
-        began = time.monotonic()
-        due = phase.first_updates + int((self.env_steps - phase.after_steps) * phase.updates_per_step)
-        chunk = max(1, round((phase.updates_per_step or 1.0) * self.schedule.cycle))
+        began, cycle, rate = time.monotonic(), self.schedule.cycle, phase.updates_per_step
+        due = phase.first_updates + int((self.env_steps - phase.after_steps) * rate)
+        # At rate 0 nothing comes after the first updates, so calls of a size that leaves none of them over.
+        chunk = max(1, round(rate * cycle)) if rate else math.gcd(phase.first_updates, cycle)
         while (done := self._updates[phase.name]) + chunk <= due and not should_stop():
             batches = [
                 c.replay.sample(chunk, phase.sampling, random_stream(c.seed, phase.name, done)) for c in self.collectors
@@ -186,8 +190,7 @@ class Training:
 
     def _evaluate(self, policies: Sequence[NumpyPolicy]) -> list[Evaluation]:
         began = time.monotonic()
-        agent, evaluations = self.learner.agent, []
-        windows = []
+        evaluations = []
         for collector, policy in zip(self.collectors, policies, strict=True):
             # The same episodes for every agent and at every evaluation: paired, so that differences are the policies'.
             seeds = [
@@ -195,23 +198,32 @@ class Training:
                 for episode in range(self.schedule.evaluation_episodes)
             ]
             evaluations.append(evaluate(self._env, policy, seeds))
-            rng = random_stream(collector.seed, "diagnose", self.env_steps)
-            windows.append(diagnosis_windows(evaluations[-1].steps, agent.diagnosis, agent.config.discount, rng))
-        metrics = self.learner.diagnose([w[0] for w in windows], [w[1] for w in windows], self.env_steps)
+        metrics = self._diagnose(evaluations)
         self._seconds["evaluating"] += time.monotonic() - began
         for index, (recorder, evaluation) in enumerate(zip(self._recorders, evaluations, strict=True)):
-            returns = evaluation.returns
+            returns = evaluation.returns or [math.nan]  # the environment failed in every episode
             row: Metrics = {
                 "eval/return_mean": float(np.mean(returns)),
                 "eval/return_std": float(np.std(returns)),
-                "eval/returns": returns,
-                "eval/length_mean": float(np.mean(evaluation.lengths)),
+                "eval/returns": evaluation.returns,
+                "eval/length_mean": float(np.mean(evaluation.lengths)) if evaluation.lengths else math.nan,
+                "eval/faults": evaluation.faults,
                 "expert_env_steps": self._expert_env_steps,
             }
             row |= {name: float(values[index]) for name, values in metrics.items()}
             recorder.write("eval", self.env_steps, row | self._clock())
             recorder.save_policy(policies[index].arrays, self.env_steps, row["eval/return_mean"])
         return evaluations
+
+    def _diagnose(self, evaluations: Sequence[Evaluation]) -> Metrics:
+        """The agent's instruments on evaluation steps, none if a seed has no step."""
+        if not all(evaluation.steps.size for evaluation in evaluations):
+            return {}
+        agent, windows = self.learner.agent, []
+        for collector, evaluation in zip(self.collectors, evaluations, strict=True):
+            rng = random_stream(collector.seed, "diagnose", self.env_steps)
+            windows.append(diagnosis_windows(evaluation.steps, agent.diagnosis, agent.config.discount, rng))
+        return self.learner.diagnose([w[0] for w in windows], [w[1] for w in windows], self.env_steps)
 
     def _log(self, stds: np.ndarray) -> None:
         for index, (collector, recorder) in enumerate(zip(self.collectors, self._recorders, strict=True)):

@@ -12,6 +12,9 @@ CONSTANT = 1e-6
 """An observation entry with a smaller standard deviation never changes (Ant's unused contact forces)."""
 
 
+LARGEST = float(np.finfo(np.float32).max)
+
+
 class Replay:
     """Transitions in the order they happened, growing; nothing is ever forgotten.
 
@@ -48,7 +51,9 @@ class Replay:
         Raises:
             ValueError: a value is not finite.
         """
-        if not (np.isfinite(reward) and np.isfinite(next_observation).all() and np.isfinite(action).all()):
+        # As float32, in which it is kept: a float64 beyond its range would become an infinity.
+        values = (observation, action, next_observation)
+        if not (abs(float(reward)) <= LARGEST and all((np.abs(value) <= LARGEST).all() for value in values)):
             raise ValueError("a transition with a value that is not finite was offered to the replay")
         if self.size == len(self._columns["reward"]):
             self._columns = {name: np.concatenate([x, np.zeros_like(x)]) for name, x in self._columns.items()}
@@ -146,7 +151,9 @@ class _Moments:
     def __init__(self, observation_size: int):
         self._count = 0
         self._terminal_count = 0
-        # Sums of the observation, its square, and the square and sum of its change; then of rewards.
+        # Counted from the first one, so that the variance of what never changes is 0 and not a rounding error.
+        self._origin = np.zeros(observation_size)
+        # Sums of the observation, its square, its change and the square of that; then of rewards.
         self._observation = np.zeros((4, observation_size))
         self._reward = np.zeros(4)
 
@@ -155,6 +162,9 @@ class _Moments:
     ) -> None:
         x, reward = observation.astype(np.float64), float(reward32)
         d = after - x
+        if self._count == 0:
+            self._origin = x
+        x = x - self._origin
         self._count += 1
         self._observation += np.stack([x, x * x, d, d * d])
         self._reward[0] += reward * reward
@@ -173,7 +183,7 @@ class _Moments:
         reward_variance = max(self._reward[3] / alive - reward_mean**2, 0.0)
         terminal = np.sqrt(self._reward[1] / self._terminal_count) if self._terminal_count else 1.0
         return Statistics(
-            observation_mean=mean.astype(np.float32),
+            observation_mean=(self._origin + mean).astype(np.float32),
             observation_std=_spread(square - mean**2),
             delta_std=_spread(change_square - change**2),
             reward_std=_spread(np.asarray(reward_variance)),

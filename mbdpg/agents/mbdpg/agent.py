@@ -37,7 +37,7 @@ class Start(NamedTuple):
 def optimizer(learning_rate: float, clip: float) -> optax.GradientTransformation:
     """Adam behind a global-norm clip; a gradient that is not finite is skipped and counted in the state."""
     return optax.apply_if_finite(
-        optax.chain(optax.clip_by_global_norm(clip), optax.adam(learning_rate, eps=1e-5)), max_consecutive_errors=10**9
+        optax.chain(optax.clip_by_global_norm(clip), optax.adam(learning_rate)), max_consecutive_errors=10**9
     )
 
 
@@ -53,7 +53,7 @@ class MBDPG:
         self._critic_optimizer = optimizer(c.critic_learning_rate, c.critic_clip)
         fitted = Sampling(c.fit_batch_size, c.burn_in, c.fit_length)
         cloned = Sampling(c.batch_size, burn_in=0, length=1, demonstrated=True)
-        improved = Sampling(c.batch_size * (1 + c.critic_updates), c.burn_in, length=1)
+        improved = Sampling(c.batch_size, c.burn_in, length=1)
         self.phases = (
             Phase("cloning", 0.0, c.random_steps, cloned, c.cloning_updates, self.clone),
             Phase("fitting", c.fits_per_step, c.random_steps, fitted, c.pretraining_fits, self.fit),
@@ -145,15 +145,37 @@ class MBDPG:
         return self._step_actor(state, gradient), {"actor/cloning_loss": value}
 
     def improve(self, state: State, batch: Batch, *, key: PRNGKeyArray) -> tuple[State, Metrics]:
-        """Critic updates on real transitions, then one of critics and actor on trajectories imagined from them."""
+        """One update of the critics (Eq. 16, 17) and of the actor (Eq. 18) on trajectories imagined after a batch."""
         c = self.config
-        real_key, imagined_key = jax.random.split(key)
-        for i in range(c.critic_updates):
-            rows = slice(i * c.batch_size, (i + 1) * c.batch_size)
-            window = self._normalized(state, jax.tree.map(lambda x, rows=rows: x[rows, -1:], batch))
-            state = self._evaluate(state, window, key=jax.random.fold_in(real_key, i))
-        window = self._normalized(state, jax.tree.map(lambda x: x[-c.batch_size :], batch))
-        return self._imagine_and_improve(state, window, key=imagined_key)
+        window = self._normalized(state, batch)
+        start_key, target_key = jax.random.split(key)
+        start = self._start(state, window, key=start_key)
+        gradient, (imagined, metrics) = jax.grad(self._actor_loss, has_aux=True)(state.actor, state, start)
+        imagined = jax.lax.stop_gradient(imagined)
+        targets = self._targets(state, window, start, imagined, key=target_key)
+
+        def loss(critics: Critics) -> tuple[Array, Array]:
+            real = critics(window.observation[:, -1], window.action[:, -1])
+            total = objectives.critic_loss(real, targets[0], jnp.ones_like(targets[0]))
+            if c.imagined_weight > 0.0:
+                along = critics(imagined.observations[:-1], imagined.actions[:-1])
+                weights = imagined.survival()[:-1] * start.weight[None]
+                total += c.imagined_weight * objectives.critic_loss(along, targets[1], weights)
+            return total, real
+
+        (critic_loss, real), critic_gradient = jax.value_and_grad(loss, has_aux=True)(state.critics)
+        state = self._step_actor(self._step_critics(state, critic_gradient), gradient)
+        if c.imagination_ratio > 0.0:
+            state = eqx.tree_at(lambda x: x.imagined, state, self._store(state.imagined, start, imagined))
+        return state, metrics | {
+            "critic/loss": critic_loss,
+            "critic/q_mean": jnp.mean(real) * state.return_scale,
+            "critic/grad_norm": optax.tree.norm(critic_gradient),
+            "critic/skipped": state.critic_optimizer.total_notfinite,
+            "actor/grad_norm": optax.tree.norm(gradient),
+            "actor/skipped": state.actor_optimizer.total_notfinite,
+            "actor/beta": state.beta,
+        }
 
     def _normalized(self, state: State, batch: Batch) -> Window:
         terminated = batch.terminated
@@ -251,50 +273,25 @@ class MBDPG:
         metrics = {"actor/objective": mean, "actor/saturation": saturation, "actor/survival": jnp.mean(survival[-1])}
         return c.saturation_penalty * saturation - mean / size, (imagined, metrics)
 
-    def _imagine_and_improve(self, state: State, window: Window, *, key: PRNGKeyArray) -> tuple[State, Metrics]:
+    def _targets(
+        self, state: State, window: Window, start: Start, imagined: Trajectory, *, key: PRNGKeyArray
+    ) -> tuple[Array, Array]:
+        """What the critics are taught: at the real transitions, shape (batch,), and along the imagined ones."""
         c = self.config
-        start_key, noise_key, real_key = jax.random.split(key, 3)
-        start = self._start(state, window, key=start_key)
-        gradient, (imagined, metrics) = jax.grad(self._actor_loss, has_aux=True)(state.actor, state, start)
-        imagined = jax.lax.stop_gradient(imagined)
-
-        values = self._target_value(state, imagined.observations, key=noise_key)
+        noise_key, real_key = jax.random.split(key)
+        # With trace 1 no value but the last is read.
+        seen = imagined.observations if c.trace < 1.0 else imagined.observations[-1:]
+        values = self._target_value(state, seen, key=noise_key)
+        values = jnp.broadcast_to(values, imagined.observations.shape[:-1])
         expanded = objectives.expanded_values(imagined.rewards, imagined.continues, values, c.discount, c.trace)
-        follows = start.depth == 0.0  # imagination went on from this very transition
-        one_step = self._target_value(state, window.next_observation[:, -1], key=real_key)
-        target = objectives.temporal_difference_target(
-            self._real_reward(state, window),
-            window.terminated[:, -1],
-            jnp.where(follows, expanded[0], one_step),
-            c.discount,
+        after = expanded[0]
+        if c.imagination_ratio > 0.0:  # where imagination went on from elsewhere, the transition has one step
+            one_step = self._target_value(state, window.next_observation[:, -1], key=real_key)
+            after = jnp.where(start.depth == 0.0, after, one_step)
+        real = objectives.temporal_difference_target(
+            self._real_reward(state, window), window.terminated[:, -1], after, c.discount
         )
-
-        def loss(critics: Critics) -> tuple[Array, Array]:
-            real = critics(window.observation[:, -1], window.action[:, -1])
-            total = objectives.critic_loss(real, target, jnp.ones_like(target))
-            if c.imagined_weight > 0.0:
-                along = critics(imagined.observations[:-1], imagined.actions[:-1])
-                weights = imagined.survival()[:-1] * start.weight[None]
-                total += c.imagined_weight * objectives.critic_loss(along, expanded, weights)
-            return total, real
-
-        (critic_loss, real), critic_gradient = jax.value_and_grad(loss, has_aux=True)(state.critics)
-        metrics |= {
-            "critic/loss": critic_loss,
-            "critic/q_mean": jnp.mean(real) * state.return_scale,
-            "critic/grad_norm": optax.tree.norm(critic_gradient),
-            "actor/grad_norm": optax.tree.norm(gradient),
-            "actor/beta": state.beta,
-        }
-        state = self._step_critics(state, critic_gradient)
-        state = self._step_actor(state, gradient)
-        metrics |= {
-            "actor/skipped": state.actor_optimizer.total_notfinite,
-            "critic/skipped": state.critic_optimizer.total_notfinite,
-        }
-        if c.imagination_ratio > 0.0:
-            state = eqx.tree_at(lambda x: x.imagined, state, self._store(state.imagined, start, imagined))
-        return state, metrics
+        return real, expanded
 
     def _store(self, buffer: ImaginationBuffer, start: Start, imagined: Trajectory) -> ImaginationBuffer:
         """Keep where imagination ended, unless it went too deep; then its start stands in, with weight 0."""

@@ -20,19 +20,17 @@ class Config:
     """Policy gradient: full differentiation of Eq. 18, or Eq. 19 as printed."""
     discount: float = 0.99
     """Discount factor gamma per environment step."""
-    batch_size: int = 128
+    batch_size: int = 64
     """Trajectories imagined, and real transitions learned from, per actor and critic update."""
     updates_per_step: float = 1.0
     """Actor and critic updates per environment step."""
-    critic_updates: int = 0
-    """Further critic updates on real transitions alone before each imagined update."""
     actor_learning_rate: float = 3e-4
     """Adam's step size for the actor."""
     critic_learning_rate: float = 3e-4
     """Adam's step size for the critics."""
     actor_clip: float = 10.0
     """Global norm to which the actor's gradient is clipped."""
-    critic_clip: float = 10.0
+    critic_clip: float = 1e6
     """Global norm to which the critics' gradient is clipped."""
     saturation_penalty: float = 1e-3
     """Weight of the mean square of the policy's output before its tanh."""
@@ -52,7 +50,7 @@ class Config:
     """Share of imagination that starts from the imagination buffer instead of the environment's."""
     imagination_depth: int = 20
     """Greatest number of imagined steps between a state in the imagination buffer and a real one."""
-    target_update_rate: float = 0.005
+    target_update_rate: float = 0.01
     """Share of the online networks that the targets take over at each of their updates (Polyak); 1 copies them."""
     target_update_every: int = 1
     """Actor and critic updates between two updates of the targets, the paper's C."""

@@ -1,0 +1,76 @@
+"""Dense layers against NumPy, at every rank, and how they start."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mbdpg.networks.mlp import MLP, LayerNorm, Linear, elu
+
+
+def shaken(module, rng: np.random.Generator):
+    """The module with every parameter drawn anew, so that no bias is 0 and no scale 1."""
+    return jax.tree.map(lambda x: jnp.asarray(rng.normal(0.3, 1.0, x.shape), jnp.float32), module)
+
+
+def numpy_mlp(mlp: MLP, x: np.ndarray) -> np.ndarray:
+    x = x.astype(np.float64)
+    for linear, norm in zip(mlp.hidden, mlp.norms, strict=True):
+        x = x @ np.asarray(linear.weight, np.float64) + np.asarray(linear.bias)
+        x = (x - x.mean(-1, keepdims=True)) / np.sqrt(x.var(-1, keepdims=True) + 1e-5)
+        x = x * np.asarray(norm.scale) + np.asarray(norm.offset)
+        x = np.where(x > 0, x, np.expm1(np.minimum(x, 0)))
+    return x @ np.asarray(mlp.output.weight, np.float64) + np.asarray(mlp.output.bias)
+
+
+def test_elu_is_the_exponential_linear_unit() -> None:
+    x = np.linspace(-6, 6, 101, dtype=np.float32)
+    np.testing.assert_allclose(elu(jnp.asarray(x)), np.where(x > 0, x, np.expm1(x)), atol=1e-6)
+
+
+@pytest.mark.parametrize(("x", "slope"), [(-200.0, 0.0), (-1.0, np.exp(-1)), (1e-3, 1.0), (200.0, 1.0), (1e30, 1.0)])
+def test_elu_has_a_finite_slope_where_its_unused_branch_would_overflow(x: float, slope: float) -> None:
+    assert jax.grad(lambda x: elu(x))(jnp.float32(x)) == pytest.approx(slope, abs=1e-6)
+
+
+@pytest.mark.parametrize("lead", [(), (5,), (2, 5), (3, 1, 2)])
+def test_a_network_is_the_same_function_at_every_rank(key: jax.Array, lead: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(0)
+    mlp = shaken(MLP(3, (8, 6), 2, key=key), rng)
+    x = rng.normal(size=(*lead, 3)).astype(np.float32)
+    np.testing.assert_allclose(mlp(jnp.asarray(x)), numpy_mlp(mlp, x), rtol=2e-4, atol=2e-4)
+
+
+def test_without_hidden_layers_a_network_is_affine(key: jax.Array) -> None:
+    mlp = shaken(MLP(3, (), 2, key=key), np.random.default_rng(1))
+    x = jnp.asarray([[1.0, -2.0, 0.5]])
+    np.testing.assert_allclose(mlp(x), x @ mlp.output.weight + mlp.output.bias[None], rtol=1e-6)
+
+
+def test_weights_start_with_the_spread_of_their_inputs_number(key: jax.Array) -> None:
+    linear = Linear(400, 300, scale=0.5, key=key)
+    assert float(jnp.std(linear.weight)) == pytest.approx(0.5 / 20, rel=0.02)
+    assert not linear.bias.any()
+
+
+def test_no_two_layers_start_alike(key: jax.Array) -> None:
+    mlp = MLP(4, (4, 4), 4, key=key)
+    weights = [np.asarray(layer.weight) for layer in (*mlp.hidden, mlp.output)]
+    assert all(np.abs(np.corrcoef(a.ravel(), b.ravel())[0, 1]) < 0.9 for a, b in zip(weights, weights[1:], strict=False))
+
+
+def test_output_scale_zero_starts_as_the_constant_zero(key: jax.Array) -> None:
+    assert not MLP(3, (8,), 2, output_scale=0.0, key=key)(jnp.ones((4, 3))).any()
+
+
+def test_layer_norm_of_equal_features_is_its_offset_with_a_finite_gradient() -> None:
+    norm = shaken(LayerNorm(4), np.random.default_rng(2))
+    same = jnp.full((2, 4), 7.0)
+    np.testing.assert_allclose(norm(same), np.broadcast_to(norm.offset, (2, 4)))
+    assert jnp.isfinite(jax.grad(lambda x: jnp.sum(jnp.square(norm(x))))(same)).all()
+
+
+def test_the_gradient_reaches_every_parameter(key: jax.Array) -> None:
+    mlp = MLP(3, (8, 8), 2, key=key)
+    gradient = jax.grad(lambda m, x: jnp.sum(jnp.square(m(x))))(mlp, jnp.asarray(np.random.default_rng(3).normal(size=(5, 3)), jnp.float32))
+    assert all(leaf.any() for leaf in jax.tree.leaves(gradient))
