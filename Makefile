@@ -1,6 +1,7 @@
 # ── The demonstration (make train): a run that shows learning in about ten minutes on two CPU cores ───────────────────
-DEMO_TASK   = InvertedDoublePendulum-v5
-DEMO_FLAGS  =
+DEMO_TASK  = HalfCheetah-v5
+DEMO_FLAGS = --steps 12000 --evaluate-every 2000
+DEMO_OUT  := runs/first-$(shell date +%Y%m%d-%H%M%S)
 # ──────────────────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 # Any of these can be set on the command line: make setup PYTHON=python3.12, make test ARGS="-k replay"
@@ -26,7 +27,11 @@ setup: $(VENV)/.installed
 setup-dev: $(VENV)/.installed-dev
 
 train: setup
-	$(BIN)/mbdpg train $(DEMO_TASK) $(DEMO_FLAGS)
+	$(BIN)/mbdpg train $(DEMO_TASK) $(DEMO_FLAGS) --out $(DEMO_OUT)
+	$(BIN)/mbdpg evaluate $(DEMO_OUT)/seed-0 --episodes 3 --video $(DEMO_OUT)/policy.mp4 || \
+	  $(BIN)/mbdpg evaluate $(DEMO_OUT)/seed-0 --episodes 3
+	@echo 'learning curve: $(DEMO_OUT)/learning-curve.png    video: $(DEMO_OUT)/policy.mp4'
+	@echo 'next: $(BIN)/mbdpg resume $(DEMO_OUT)/seed-0 --steps 50000    goes on from here to a much better one'
 
 test: setup-dev
 	@$(BIN)/python -m pytest -q -n $(WORKERS) $(ARGS)

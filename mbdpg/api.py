@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import gymnasium
 import numpy as np
 
 from mbdpg import envs
 from mbdpg.agents import mbdpg, td3
 from mbdpg.experiments import run
+from mbdpg.experiments.config import RunConfig
 from mbdpg.interfaces import Environment
 from mbdpg.networks.policy import NumpyPolicy
 from mbdpg.training.evaluation import Evaluation, evaluate as run_episodes
 from mbdpg.training.loop import Schedule, Update
 
-Env = str | Callable[[], gymnasium.Env]
+Env = str | envs.MakeGymnasium
 """A Gymnasium id, or a function that makes an environment."""
 
 
@@ -48,7 +48,7 @@ def train(
         UserError: something you can mend, said in one line.
     """
     agent = mbdpg.Config() if config is None else config
-    settings = run.RunConfig(
+    settings = RunConfig(
         env=env if isinstance(env, str) else _name(env),
         algorithm="td3" if isinstance(agent, td3.Config) else "mbdpg",
         agent=agent,
@@ -63,7 +63,7 @@ def train(
 def resume(
     path: str | Path,
     *,
-    env: Callable[[], gymnasium.Env] | None = None,
+    env: envs.MakeGymnasium | None = None,
     steps: int | None = None,
     on_evaluation: Callable[[Update], None] | None = None,
 ) -> None:
@@ -78,7 +78,8 @@ def resume(
     Raises:
         UserError: not a run, or damaged beyond its checkpoints.
     """
-    run.resume(Path(path), make_env=_maker(env), steps=steps, on_update=_only_evaluations(on_evaluation))
+    on_update = _only_evaluations(on_evaluation)
+    run.resume(Path(path), make_env=_maker(env), steps=steps, watch=lambda config, env_steps: on_update)
 
 
 def load_policy(path: str | Path, *, best: bool = False) -> NumpyPolicy:
@@ -118,7 +119,7 @@ def _maker(env: Env | None) -> Callable[[], Environment] | None:
     return lambda: envs.wrap(env(), name=_name(env))
 
 
-def _name(env: Callable[[], gymnasium.Env]) -> str:
+def _name(env: envs.MakeGymnasium) -> str:
     return str(getattr(env, "__name__", type(env).__name__))
 
 

@@ -150,10 +150,15 @@ class Phase(NamedTuple):
 class Agent(Protocol):
     """What the training loop knows of an algorithm. States are pytrees of arrays; functions are pure, for one seed."""
 
-    config: Any
-    """Its own Config; every one has `discount` and `random_steps`."""
-    env: EnvSpec
-    phases: Sequence[Phase]
+    @property
+    def config(self) -> Any:
+        """Its own Config; every one has `discount` and `random_steps`."""
+
+    @property
+    def env(self) -> EnvSpec: ...
+
+    @property
+    def phases(self) -> Sequence[Phase]: ...
 
     def init(self, *, key: Any) -> Any:
         """A fresh state."""

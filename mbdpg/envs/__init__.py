@@ -1,3 +1,8 @@
 """Where Gymnasium ends: everything past this package sees `mbdpg.interfaces.Environment` alone."""
 
-from mbdpg.envs.make import episode_seed as episode_seed, make as make, wrap as wrap
+from mbdpg.envs.make import (
+    MakeGymnasium as MakeGymnasium,
+    episode_seed as episode_seed,
+    make as make,
+    wrap as wrap,
+)

@@ -10,7 +10,7 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -43,6 +43,9 @@ OLD_IDS = {f"{name}-v{version}": f"{name}-v5" for name in _MUJOCO_NAMES for vers
 }
 
 ANT_CONTACT_FORCES = {27: False, 105: True}  # observation size of Ant-v5, to whether it includes 78 contact forces
+
+MakeGymnasium = Callable[[], gymnasium.Env[Any, Any]]
+"""Makes an environment of a user's own."""
 
 ROLES = ("train", "evaluate", "expert", "video")
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 from typing import Any, Literal
 
 from mbdpg.agents import mbdpg, td3
-from mbdpg.interfaces import UserError
+from mbdpg.experiments.config import CONFIGS, EnvOptions
+from mbdpg.interfaces import require
+from mbdpg.training.loop import Schedule
 
-Algorithm = Literal["mbdpg", "td3"]
 Preset = Literal["default", "paper"]
 
-CONFIGS: dict[Algorithm, type[mbdpg.Config] | type[td3.Config]] = {"mbdpg": mbdpg.Config, "td3": td3.Config}
-
-PAPER: dict[Algorithm, dict[str, Any]] = {
+PAPER: dict[str, dict[str, Any]] = {
     # Section 5.1 and 5.3.1, and Eq. 11, 16, 18 and 19 as printed where that can be learned from at all.
     "mbdpg": {
         "horizon": 20,
@@ -42,15 +41,20 @@ PAPER: dict[Algorithm, dict[str, Any]] = {
     "td3": {},
 }
 
-PAPER_SCHEDULE: dict[str, Any] = {"steps": 200_000}
+PAPER_STEPS = 200_000
 PAPER_EPISODE_LIMIT = 1000
 """Section 5.1 cuts every episode, in training and test, at 1,000 steps."""
 
 
-def agent_config(algorithm: Algorithm, preset: Preset) -> mbdpg.Config | td3.Config:
+def agent_config(algorithm: str, preset: str) -> mbdpg.Config | td3.Config:
     """The algorithm's settings under a preset."""
-    if algorithm not in CONFIGS:
-        raise UserError(f"unknown algorithm {algorithm!r}; expected one of {', '.join(CONFIGS)}")
-    if preset not in ("default", "paper"):
-        raise UserError(f"unknown preset {preset!r}; expected default or paper")
+    require(algorithm in CONFIGS, f"unknown --algorithm {algorithm!r}; expected one of {', '.join(CONFIGS)}")
+    require(preset in ("default", "paper"), f"unknown --preset {preset!r}; expected default or paper")
     return CONFIGS[algorithm](**(PAPER[algorithm] if preset == "paper" else {}))
+
+
+def run_settings(preset: str) -> tuple[Schedule, EnvOptions]:
+    """Length of a run and of its episodes under a preset."""
+    if preset == "paper":
+        return Schedule(steps=PAPER_STEPS), EnvOptions(max_episode_steps=PAPER_EPISODE_LIMIT)
+    return Schedule(), EnvOptions()

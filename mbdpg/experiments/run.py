@@ -5,16 +5,14 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import subprocess
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mbdpg import envs
 from mbdpg.agents import mbdpg, td3
-from mbdpg.experiments.presets import CONFIGS, Algorithm
+from mbdpg.experiments.config import RunConfig
 from mbdpg.imitation.demonstrations import Demonstrations
 from mbdpg.interfaces import Agent, Environment, EnvSpec, Metrics, UserError, require
 from mbdpg.networks.policy import NumpyPolicy
@@ -24,64 +22,11 @@ from mbdpg.storage.metrics import MetricsLog
 from mbdpg.storage.run_folder import RunFolder, describe_machine
 from mbdpg.training.collector import Collector
 from mbdpg.training.learner import Learner
-from mbdpg.training.loop import Schedule, Training, Update
+from mbdpg.training.loop import Training, Update
 from mbdpg.training.replay import Replay
 
 MakeEnvironment = Callable[[], Environment]
 OnUpdate = Callable[[Update], None]
-
-
-@dataclass(frozen=True)
-class EnvOptions:
-    """How the environment is made."""
-
-    max_episode_steps: int | None = None
-    """Steps after which an episode is truncated, instead of the environment's own limit."""
-    observation_size: int | None = None
-    """27 or 105, for Ant-v5: without or with contact forces."""
-    allow_import: bool = False
-    """Allow an id of the form module:Id, which imports and so runs that module's code."""
-
-
-@dataclass(frozen=True)
-class RunConfig:
-    """Everything that decides a run, but for its seed."""
-
-    env: str
-    """Gymnasium id, or a name for an environment made in code."""
-    algorithm: Algorithm = "mbdpg"
-    agent: mbdpg.Config | td3.Config = field(default_factory=mbdpg.Config)
-    schedule: Schedule = field(default_factory=Schedule)
-    env_options: EnvOptions = field(default_factory=EnvOptions)
-    demonstrations: str | None = None
-    """File of demonstrations to begin with."""
-
-    def make_env(self, *, render: bool = False) -> Environment:
-        """The environment, from Gymnasium's registry."""
-        return envs.make(self.env, render=render, **dataclasses.asdict(self.env_options))
-
-    @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> RunConfig:
-        """Read what a run's config.json holds.
-
-        Raises:
-            UserError: a field is unknown, missing or of the wrong type.
-        """
-        algorithm = data.get("algorithm")
-        require(
-            algorithm in CONFIGS, f"config.json has algorithm {str(algorithm)[:40]!r}, expected {', '.join(CONFIGS)}"
-        )
-        demonstrations, env = data.get("demonstrations"), data.get("env")
-        require(isinstance(env, str), "config.json does not say which environment the run is of")
-        require(demonstrations is None or isinstance(demonstrations, str), "config.json has odd demonstrations")
-        return cls(
-            env=str(env),
-            algorithm=algorithm,  # type: ignore[arg-type]  # checked above
-            agent=_settings(CONFIGS[algorithm], data.get("agent"), "agent"),  # type: ignore[index]
-            schedule=_settings(Schedule, data.get("schedule"), "schedule"),
-            env_options=_settings(EnvOptions, data.get("env_options"), "env_options"),
-            demonstrations=demonstrations,
-        )
 
 
 def train(
@@ -134,10 +79,9 @@ def resume(
     make_env: MakeEnvironment | None = None,
     steps: int | None = None,
     allow_import: bool = False,
-    on_start: Callable[[RunConfig, int], None] = lambda config, env_steps: None,
-    on_update: OnUpdate = lambda update: None,
+    watch: Callable[[RunConfig, int], OnUpdate] = lambda config, env_steps: lambda update: None,
     should_stop: Callable[[], bool] = lambda: False,
-) -> RunConfig:
+) -> None:
     """Go on with one run exactly where its newest undamaged checkpoint is.
 
     Args:
@@ -145,8 +89,7 @@ def resume(
         make_env: as for `train`; needed if the run was given one.
         steps: environment steps of the whole run, if it shall be longer than it was meant to be.
         allow_import: allow an id of the form module:Id, whatever the folder says: it may come from a stranger.
-        on_start: called with the run's config and the step it goes on from.
-        on_update: as for `train`.
+        watch: given the run's config and the step it goes on from, returns what `train` calls `on_update`.
         should_stop: as for `train`.
 
     Raises:
@@ -166,24 +109,35 @@ def resume(
         checkpoint = load_checkpoint(path)
         recorder = _Recorder(folder, checkpoint)
         training = _compose(config, _spec_of(make), make, [_seed_of(folder)], [recorder], stack, None, checkpoint)
-        on_start(config, training.env_steps)
-        training.run(on_update, should_stop)
-    return config
+        training.run(watch(config, training.env_steps), should_stop)
 
 
-def load_policy(path: Path, *, best: bool = False) -> NumpyPolicy:
+def load_policy(path: Path, *, best: bool = False, spec: EnvSpec | None = None) -> NumpyPolicy:
     """The policy of a run folder: its latest, or the one with the best evaluation.
 
     Raises:
-        UserError: there is none, or it is damaged.
+        UserError: there is none, it is damaged, or it is not for the environment that `spec` describes.
     """
     name = path / "policy" / ("best.safetensors" if best else "latest.safetensors")
     if not name.is_file():
         raise UserError(f"{path} has no {name.name} yet; expected a run folder that has evaluated at least once")
     try:
-        return NumpyPolicy(read_array_file(name, "policy")[0])
+        policy = NumpyPolicy(read_array_file(name, "policy")[0])
     except ValueError as error:
         raise UserError(f"{name} is not a policy: {error}") from error
+    if spec is not None:
+        sizes, wanted = (policy.observation_size, policy.action_size), (spec.observation_size, spec.action_size)
+        require(
+            sizes == wanted,
+            f"the policy of {path} is for {sizes[0]} observation and {sizes[1]} action entries, but {spec.id} has "
+            f"{wanted[0]} and {wanted[1]}; expected a run of {spec.id}",
+        )
+    return policy
+
+
+def policy_facts(path: Path) -> dict[str, Any]:
+    """The `env_steps` and evaluated `return_mean` of a run's latest policy."""
+    return read_array_file(path / "policy" / "latest.safetensors", "policy")[1]
 
 
 class _Recorder:
@@ -271,20 +225,6 @@ def _seed_of(folder: RunFolder) -> int:
     seed = folder.config.get("seed")
     require(isinstance(seed, int) and 0 <= seed < 2**31, f"{folder.path} has seed {seed!r} in its config.json")
     return int(seed)  # type: ignore[arg-type]  # checked above
-
-
-def _settings(kind: type[Any], data: Any, name: str) -> Any:
-    """A config dataclass from JSON, refusing what it does not know and what has another type than its default."""
-    known = {field.name: field.default for field in dataclasses.fields(kind)}
-    require(isinstance(data, dict), f"config.json has no {name}")
-    require(
-        data.keys() == known.keys(),
-        f"config.json does not fit this version of mbdpg: {name} differs in {sorted(data.keys() ^ known.keys())[:5]}",
-    )
-    for key, default in known.items():
-        kinds = (int, type(None)) if default is None else (int, float) if isinstance(default, float) else type(default)
-        require(isinstance(data[key], kinds), f"config.json has {name}.{key} = {str(data[key])[:40]!r}")
-    return kind(**data)
 
 
 def _commit() -> str | None:

@@ -45,7 +45,8 @@ class Demonstrations:
         """
         columns, facts = read_array_file(path, "demonstrations")
         steps = facts.get("expert_env_steps")
-        require(isinstance(steps, int) and steps >= 0, f"{path} does not say how many steps its expert took")
+        if not isinstance(steps, int) or steps < 0:
+            raise UserError(f"{path} does not say how many steps its expert took; expected a number of at least 0")
         replay = Replay.from_columns(columns)
         wanted = (spec.observation_size, spec.action_size)
         found = (columns["observation"].shape[1], columns["action"].shape[1])
@@ -57,7 +58,7 @@ class Demonstrations:
         require(replay.size > 0, f"{path} has no steps; expected at least one successful episode")
         require(bool((np.abs(columns["action"]) <= 1.0).all()), f"{path} has actions outside [-1, 1]")
         replay.close_episode()
-        return cls(replay, str(facts.get("env")), int(steps), facts)
+        return cls(replay, str(facts.get("env")), steps, facts)
 
 
 def record(

@@ -114,7 +114,11 @@ class Training:
         """Write every seed's checkpoint."""
         self._saved = (self.env_steps, *self._updates.values())
         for index, (collector, recorder) in enumerate(zip(self.collectors, self._recorders, strict=True)):
-            facts = {"collector": collector.facts(), "updates": self._updates, "sums": self._sums[index]}
+            facts: dict[str, Any] = {
+                "collector": collector.facts(),
+                "updates": self._updates,
+                "sums": self._sums[index],
+            }
             facts |= {
                 "recorded": self._recorded,
                 "expert_env_steps": self._expert_env_steps,

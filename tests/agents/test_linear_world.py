@@ -56,7 +56,7 @@ def world(survival: float = 0.8, seed: int = 0) -> State:
     """A state of the agent that lives in the linear world, with policy and critics of one layer."""
     rng = np.random.default_rng(seed)
     agent = MBDPG(Config(batch_size=BATCH, burn_in=0, width=8, memory=MEMORY, gaussians=M), ENV)
-    state = agent.init(key=jax.random.key(0))
+    state = jax.jit(lambda key: agent.init(key=key))(jax.random.key(0))
     actor = Policy(O, A, (), key=jax.random.key(0))
     actor = eqx.tree_at(lambda x: x.mlp, actor, without_layers(actor.mlp, affine(rng, O, A, 0.5)))
     critics = Critics(O, A, (), key=jax.random.key(0))
@@ -248,13 +248,14 @@ def test_exact_critics_are_a_fixed_point(trace: float, imagination_ratio: float)
     x = np.concatenate([s, a, np.ones((BATCH, 1, 1))], axis=-1)
     ones = np.ones((BATCH, 1), np.float32)
     batch = Batch(*(np.float32(y) for y in (s, a, x @ w, s + x @ d.T)), 0 * ones, ones)
+    batch = jax.tree.map(jnp.asarray, batch)
     state = eqx.tree_at(
         lambda y: (y.critic_optimizer, y.actor_optimizer),
         state,
         (agent._critic_optimizer.init(state.critics), agent._actor_optimizer.init(state.actor)),
     )
     improve = jax.jit(lambda s, b: agent.improve(s, b, key=jax.random.key(0)))
-    values = state.critics(jnp.asarray(batch.observation[:, 0]), jnp.asarray(batch.action[:, 0]))
+    values = state.critics(batch.observation[:, 0], batch.action[:, 0])
     assert jnp.std(values) > 0.3
     after, metrics = improve(state, batch)
     assert float(metrics["critic/loss"]) < 1e-9

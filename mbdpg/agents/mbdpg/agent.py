@@ -268,8 +268,8 @@ class MBDPG:
         )
         count = jnp.maximum(jnp.sum(start.weight), 1.0)
         mean = jnp.sum(objective * start.weight) / count
-        size = jax.lax.stop_gradient(jnp.maximum(jnp.mean(jnp.abs(objective)), 1.0))
-        saturation = jnp.mean(jnp.square(actor.mlp(start.observation)))
+        size = jax.lax.stop_gradient(jnp.maximum(jnp.sum(jnp.abs(objective) * start.weight) / count, 1.0))
+        saturation = jnp.sum(jnp.mean(jnp.square(actor.mlp(start.observation)), axis=-1) * start.weight) / count
         metrics = {"actor/objective": mean, "actor/saturation": saturation, "actor/survival": jnp.mean(survival[-1])}
         return c.saturation_penalty * saturation - mean / size, (imagined, metrics)
 
@@ -294,9 +294,10 @@ class MBDPG:
         return real, expanded
 
     def _store(self, buffer: ImaginationBuffer, start: Start, imagined: Trajectory) -> ImaginationBuffer:
-        """Keep where imagination ended, unless it went too deep; then its start stands in, with weight 0."""
+        """Keep where imagination ended, with weight 0 (nothing starts there) if it went too deep."""
         depth = start.depth + self.config.horizon
-        weight = imagined.survival()[-1] * start.weight * (depth <= self.config.imagination_depth)
+        shallow = depth <= self.config.imagination_depth
+        weight = jnp.where(shallow, imagined.survival()[-1] * start.weight, 0.0)
         return buffer.add(imagined.observations[-1], imagined.memory, weight, depth)
 
     @property

@@ -1,0 +1,42 @@
+"""The command line."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from mbdpg.cli.flags import one_line
+from mbdpg.cli.verbs import VERBS
+from mbdpg.interfaces import UserError, require
+
+OVERVIEW = """usage: mbdpg VERB ...
+
+Learn continuous control from few samples: model-based deterministic policy gradient (Gao et al. 2022) in JAX.
+
+  mbdpg train ENV            learn a policy, for example: mbdpg train HalfCheetah-v5 --steps 50000
+  mbdpg resume RUN           go on exactly where a run stopped
+  mbdpg evaluate RUN         run the learned policy, for example: --episodes 10 --video out.mp4
+  mbdpg demonstrate ENV      train an expert with TD3 and record its successful episodes
+
+Every verb has its own --help; --debug shows tracebacks.
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run one verb; exits with 1 on an error that a person can mend, 2 on wrong usage, 128 + n on signal n."""
+    args = list(sys.argv[1:] if arguments is None else arguments)
+    if not args or args[0] in ("-h", "--help"):
+        print(OVERVIEW, end="")
+        return
+    try:
+        require(args[0] in VERBS, f"there is no verb {args[0]!r}; expected one of {', '.join(VERBS)}")
+        VERBS[args[0]](args[1:])
+    except BrokenPipeError:  # whoever read our output has seen enough
+        sys.stderr.close()
+        sys.exit(1)
+    except Exception as error:
+        if "--debug" in args:
+            raise
+        if isinstance(error, UserError):
+            sys.exit(f"mbdpg: {one_line(str(error))}")
+        sys.exit(f"mbdpg: unexpected {type(error).__name__}: {one_line(str(error))}; --debug shows where")

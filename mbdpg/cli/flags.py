@@ -1,0 +1,46 @@
+"""From a verb's flags to a dataclass; wrong usage is one line."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import tyro
+
+
+def parse(kind: type[Any], verb: str, args: Sequence[str]) -> Any:
+    """Parse a verb's flags into `kind`, or explain what was wrong and exit with status 2."""
+    stderr = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(stderr):
+            return tyro.cli(kind, prog=f"mbdpg {verb}", args=args, description=kind.__doc__)
+    except SystemExit as stop:
+        if stop.code in (0, None):
+            raise
+        print(f"mbdpg {verb}: {_plain(stderr.getvalue())}", file=sys.stderr)
+        sys.exit(2)
+
+
+def peek(args: Sequence[str], flag: str, default: str) -> str:
+    """A flag's value before the rest can be parsed, because the rest depends on it."""
+    for position, arg in enumerate(args):
+        if arg == f"--{flag}" and position + 1 < len(args):
+            return args[position + 1]
+        if arg.startswith(f"--{flag}="):
+            return arg.split("=", 1)[1]
+    return default
+
+
+def one_line(text: str) -> str:
+    """Text without line breaks, cut where nobody reads on."""
+    return re.sub(r"\s+", " ", text).strip()[:500]
+
+
+def _plain(text: str) -> str:
+    """Tyro's boxed explanation as one line."""
+    without_colors = re.sub(r"\x1b\[[0-9;]*m", "", text)
+    return one_line(re.sub(r"[╭╮╰╯│─]+", " ", without_colors))

@@ -1,0 +1,84 @@
+"""Everything that decides a run, but for its seed."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from mbdpg import envs
+from mbdpg.agents import mbdpg, td3
+from mbdpg.interfaces import Environment, require
+from mbdpg.training.loop import Schedule
+
+Algorithm = Literal["mbdpg", "td3"]
+
+CONFIGS: dict[str, type[mbdpg.Config] | type[td3.Config]] = {"mbdpg": mbdpg.Config, "td3": td3.Config}
+
+
+@dataclass(frozen=True)
+class EnvOptions:
+    """How the environment is made."""
+
+    max_episode_steps: int | None = None
+    """Steps after which an episode is truncated, instead of the environment's own limit."""
+    observation_size: int | None = None
+    """27 or 105, for Ant-v5: without or with contact forces."""
+    allow_import: bool = False
+    """Allow an id of the form module:Id, which imports and so runs that module's code."""
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Everything that decides a run, but for its seed."""
+
+    env: str
+    """Gymnasium id, or a name for an environment made in code."""
+    algorithm: Algorithm = "mbdpg"
+    agent: mbdpg.Config | td3.Config = field(default_factory=mbdpg.Config)
+    schedule: Schedule = field(default_factory=Schedule)
+    env_options: EnvOptions = field(default_factory=EnvOptions)
+    demonstrations: str | None = None
+    """File of demonstrations to begin with."""
+
+    def make_env(self, *, render: bool = False) -> Environment:
+        """The environment, from Gymnasium's registry."""
+        return envs.make(self.env, render=render, **dataclasses.asdict(self.env_options))
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> RunConfig:
+        """Read what a run's config.json holds.
+
+        Raises:
+            UserError: a field is unknown, missing or of the wrong type.
+        """
+        algorithm = data.get("algorithm")
+        require(
+            algorithm in CONFIGS, f"config.json has algorithm {str(algorithm)[:40]!r}, expected {', '.join(CONFIGS)}"
+        )
+        demonstrations, env = data.get("demonstrations"), data.get("env")
+        require(isinstance(env, str), "config.json does not say which environment the run is of")
+        require(demonstrations is None or isinstance(demonstrations, str), "config.json has odd demonstrations")
+        return cls(
+            env=str(env),
+            algorithm=algorithm,  # type: ignore[arg-type]  # checked above
+            agent=_settings(CONFIGS[algorithm], data.get("agent"), "agent"),  # type: ignore[index]
+            schedule=_settings(Schedule, data.get("schedule"), "schedule"),
+            env_options=_settings(EnvOptions, data.get("env_options"), "env_options"),
+            demonstrations=demonstrations,
+        )
+
+
+def _settings(kind: type[Any], data: Any, name: str) -> Any:
+    """A config dataclass from JSON, refusing what it does not know and what has another type than its default."""
+    known = {field.name: field.default for field in dataclasses.fields(kind)}
+    require(isinstance(data, dict), f"config.json has no {name}")
+    require(
+        data.keys() == known.keys(),
+        f"config.json does not fit this version of mbdpg: {name} differs in {sorted(data.keys() ^ known.keys())[:5]}",
+    )
+    for key, default in known.items():
+        kinds = (int, type(None)) if default is None else (int, float) if isinstance(default, float) else type(default)
+        require(isinstance(data[key], kinds), f"config.json has {name}.{key} = {str(data[key])[:40]!r}")
+    return kind(**data)

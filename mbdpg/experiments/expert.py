@@ -1,0 +1,58 @@
+"""Learning from success (Section 4.2): a TD3 expert, and what of its behavior is worth imitating."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mbdpg.experiments.config import EnvOptions, RunConfig
+from mbdpg.experiments.presets import agent_config
+from mbdpg.experiments.run import load_policy, policy_facts
+from mbdpg.imitation.demonstrations import Demonstrations, record
+from mbdpg.interfaces import UserError, require
+from mbdpg.training.loop import Schedule
+
+
+def config_of(env: str, steps: int, env_options: EnvOptions) -> RunConfig:
+    """The expert's training: TD3 for `steps` environment steps."""
+    return RunConfig(env, "td3", agent_config("td3", "default"), Schedule(steps=steps), env_options)
+
+
+def record_from(
+    run: Path,
+    env: str,
+    env_options: EnvOptions,
+    *,
+    episodes: int,
+    success_return: float | None,
+    seed: int,
+) -> Demonstrations:
+    """Record successful episodes of a run's best policy, by whatever algorithm it was trained.
+
+    Args:
+        run: the expert's run folder.
+        env: Gymnasium id to record in.
+        env_options: how it is made.
+        episodes: successes to record.
+        success_return: least return of a success; None for the environment's reference return.
+        seed: decides the episodes.
+
+    Raises:
+        UserError: nobody knows what a success is, or there was none.
+    """
+    require(episodes >= 1, f"--episodes is {episodes}, expected at least 1")
+    made = RunConfig(env, env_options=env_options).make_env()
+    try:
+        success = made.spec.reference_return if success_return is None else success_return
+        if success is None:
+            raise UserError(f"nobody knows what a success in {env} is; say so with --success-return")
+        policy = load_policy(run, best=True, spec=made.spec)
+        return record(
+            made,
+            policy,
+            episodes=episodes,
+            success_return=success,
+            expert_env_steps=int(policy_facts(run)["env_steps"]),
+            seed=seed,
+        )
+    finally:
+        made.close()

@@ -1,0 +1,388 @@
+"""What each update of MBDPG moves, what it must not, and what it does with odd data."""
+
+import ast
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mbdpg.agents.mbdpg
+from mbdpg.agents.mbdpg import MBDPG, Config, State
+from mbdpg.interfaces import Batch, EnvSpec, Statistics, UserError
+from mbdpg.training.loop import Schedule
+from mbdpg.training.replay import Replay
+
+O, A, BATCH, BURN_IN, LENGTH = 3, 2, 4, 2, 3
+ENV = EnvSpec("made-in-code", observation_size=O, action_size=A, episode_limit=None, reference_return=None)
+NETWORKS = {"width": 8, "memory": 8, "gaussians": 2}
+SHAPES = {"batch_size": BATCH, "fit_batch_size": BATCH, "burn_in": BURN_IN, "fit_length": LENGTH, "horizon": 2}
+PAPER = {
+    "gradient": "eq19",
+    "likelihood": "eq11",
+    "reward_weights": "uniform",
+    "first_value": 1,
+    "trace": 0.95,
+    "imagination_ratio": 0.5,
+    "imagination_depth": 4,
+    "target_update_every": 3,
+    "target_update_rate": 0.25,
+}
+"""The other value of every switch."""
+MODES = pytest.mark.parametrize("settings", [(), tuple(PAPER.items())], ids=["default", "paper"])
+
+
+@functools.cache
+def agent(settings: tuple = ()) -> MBDPG:
+    return MBDPG(Config(**NETWORKS, **SHAPES, **dict(settings)), ENV)
+
+
+@functools.cache
+def update(name: str, settings: tuple = ()) -> Callable[..., tuple[State, dict[str, Any]]]:
+    """One compiled update; the agents share their states, whatever their settings."""
+    chosen = getattr(agent(settings), name)
+    return jax.jit(lambda state, batch, key=jax.random.key(0): chosen(state, batch, key=key))
+
+
+@functools.cache
+def fresh() -> State:
+    return jax.jit(lambda key: agent().init(key=key))(jax.random.key(0))
+
+
+@functools.cache
+def state() -> State:
+    """Networks away from their start, targets away from what they follow, scales away from 1."""
+    rng = np.random.default_rng(0)
+
+    def shaken(network):
+        return jax.tree.map(lambda x: x + jnp.asarray(rng.normal(0, 0.2, x.shape), jnp.float32), network)
+
+    def networks(x: State):
+        return x.dynamics, x.actor, x.critics, x.target_actor, x.target_critics
+
+    moved = eqx.tree_at(networks, fresh(), tuple(map(shaken, networks(fresh()))))
+    return jax.jit(agent().prepare)(moved, statistics())
+
+
+def statistics(progress: float = 0.25) -> Statistics:
+    numbers = ([0.1, -0.2, 0.3], [1.0, 2.0, 0.5], [0.2, 1.0, 0.25], 0.8, 5.0, 2.0, progress)
+    return Statistics(*(jnp.asarray(x, jnp.float32) for x in numbers))
+
+
+def batch(length: int, size: int = BATCH, seed: int = 0) -> Batch:
+    rng = np.random.default_rng(seed)
+
+    def draw(*shape: int) -> np.ndarray:
+        return rng.normal(size=(size, length, *shape)).astype(np.float32)
+
+    ones = np.ones((size, length), np.float32)
+    return Batch(draw(O), np.tanh(draw(A)), draw(), draw(O), 0 * ones, ones)
+
+
+BATCHES = {"fit": batch(BURN_IN + LENGTH), "clone": batch(1), "improve": batch(BURN_IN + 1)}
+MOVES = {
+    "fit": {"dynamics", "dynamics_optimizer"},
+    "clone": {"actor", "critics", "target_actor", "target_critics", "actor_optimizer", "critic_optimizer"},
+    "improve": {"actor", "critics", "target_actor", "target_critics", "actor_optimizer", "critic_optimizer"},
+}
+
+
+def differences(before: Any, after: Any) -> set[str]:
+    """Fields in which two states differ in any bit."""
+
+    def same(a: jax.Array, b: jax.Array) -> bool:
+        return np.asarray(a).tobytes() == np.asarray(b).tobytes()
+
+    return {
+        name
+        for name in vars(before)
+        if not all(jax.tree.leaves(jax.tree.map(same, getattr(before, name), getattr(after, name))))
+    }
+
+
+def finite(tree: Any) -> bool:
+    return all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(tree))
+
+
+def edited(original: Batch, **changes: tuple[Any, float]) -> Batch:
+    """A copy with a number written at an index of some fields."""
+    copy = jax.tree.map(np.copy, original)
+    for name, (at, value) in changes.items():
+        getattr(copy, name)[at] = value
+    return copy
+
+
+@pytest.mark.parametrize("name", ["fit", "clone", "improve"])
+def test_an_update_moves_its_own_networks_and_nothing_else(name: str) -> None:
+    after, metrics = update(name)(state(), BATCHES[name])
+    assert differences(state(), after) == MOVES[name] | ({"critic_steps"} if name != "fit" else set())
+    assert finite(after) and finite(metrics)
+
+
+def test_the_papers_settings_move_the_same_and_fill_the_imagination_buffer() -> None:
+    settings = tuple(PAPER.items())
+    after, metrics = update("fit", settings)(state(), BATCHES["fit"])
+    assert differences(state(), after) == MOVES["fit"]
+    assert finite(after) and finite(metrics)
+    after, metrics = update("improve", settings)(state(), BATCHES["improve"])
+    # The targets wait for the third update.
+    expected = {"actor", "critics", "actor_optimizer", "critic_optimizer", "critic_steps", "imagined"}
+    assert differences(state(), after) == expected
+    assert finite(after) and finite(metrics)
+
+
+@pytest.mark.parametrize("name", ["dynamics", "actor", "critics"])
+def test_every_parameter_is_moved_by_its_update(name: str) -> None:
+    kind = "fit" if name == "dynamics" else "improve"
+    ends = edited(BATCHES[kind], terminated=((0, -1), 1))
+    before, after = getattr(state(), name), getattr(update(kind)(state(), ends)[0], name)
+    for (path, x), y in zip(jax.tree_util.tree_leaves_with_path(before), jax.tree.leaves(after), strict=True):
+        assert (x != y).any(), jax.tree_util.keystr(path)
+
+
+def test_a_fresh_state_has_targets_equal_to_what_they_follow() -> None:
+    fresh_state = fresh()
+    for online, target in (("actor", "target_actor"), ("critics", "target_critics")):
+        pairs = zip(*(jax.tree.leaves(getattr(fresh_state, name)) for name in (online, target)), strict=True)
+        assert all(np.array_equal(x, y) for x, y in pairs)
+    assert finite(update("improve")(fresh_state, BATCHES["improve"])[0])
+
+
+def test_targets_follow_at_their_rate_at_every_update() -> None:
+    before = state()
+    after, _ = update("improve")(before, BATCHES["improve"])
+    rate = agent().config.target_update_rate
+    # The target actor follows the actor as it was when the critics' targets were made.
+    for target, online in (("target_critics", after.critics), ("target_actor", before.actor)):
+        for old, new, followed in zip(
+            *map(jax.tree.leaves, (getattr(before, target), getattr(after, target), online)), strict=True
+        ):
+            np.testing.assert_allclose(new, (1 - rate) * old + rate * followed, rtol=1e-5, atol=1e-6)
+
+
+def test_targets_wait_for_the_third_update_where_c_is_3() -> None:
+    step = update("improve", tuple(PAPER.items()))
+    states = [state()]
+    for i in range(6):
+        states.append(step(states[-1], BATCHES["improve"], jax.random.key(i))[0])
+    moved = [{"target_actor", "target_critics"} & differences(a, b) for a, b in zip(states, states[1:], strict=False)]
+    both = {"target_actor", "target_critics"}
+    assert moved == [set(), set(), both, set(), set(), both]
+    for old, new, followed in zip(
+        *map(jax.tree.leaves, (states[2].target_critics, states[3].target_critics, states[3].critics)), strict=True
+    ):
+        np.testing.assert_allclose(new, 0.75 * old + 0.25 * followed, rtol=1e-5, atol=1e-6)
+
+
+@MODES
+@pytest.mark.parametrize("poison", [np.nan, np.inf])
+def test_a_batch_that_is_not_finite_moves_nothing_and_is_counted(settings: tuple, poison: float) -> None:
+    bad = edited(BATCHES["fit"], reward=((0, BURN_IN), poison))
+    after, metrics = update("fit", settings)(state(), bad)
+    assert differences(state(), after) == {"dynamics_optimizer"}
+    assert metrics["dynamics/skipped"] == 1
+    # Infinite observations are clipped by the normalizer: nothing to skip. NaN reaches both, a reward the critics.
+    bad = edited(BATCHES["improve"], reward=((0, -1), poison), next_observation=((1, -1), np.nan))
+    after, metrics = update("improve", settings)(state(), bad)
+    assert not {"actor", "critics", "dynamics"} & differences(state(), after)
+    assert metrics["actor/skipped"] == 1 and metrics["critic/skipped"] == 1
+    assert finite((after.target_actor, after.target_critics, after.actor_optimizer, after.critic_optimizer))
+    again, metrics = update("improve", settings)(after, BATCHES["improve"])
+    assert {"actor", "critics"} <= differences(after, again)
+    assert finite((again.actor, again.critics)) and finite(metrics)
+    assert metrics["actor/skipped"] == 1 and metrics["critic/skipped"] == 1
+
+
+@MODES
+def test_nothing_is_imagined_after_the_end_of_an_episode(settings: tuple) -> None:
+    """The state in which an episode ended: neither actor nor critics may learn from it or from what would follow."""
+    ended = edited(BATCHES["improve"], terminated=((0, -1), 1))
+    after, metrics = update("improve", settings)(state(), ended)
+    elsewhere, other = update("improve", settings)(state(), edited(ended, next_observation=((0, -1), 3.0)))
+    assert differences(after, elsewhere) <= {"imagined"}
+    assert metrics["actor/objective"] == other["actor/objective"]
+    assert after.imagined.weight[0] == 0
+    alive, _ = update("improve", settings)(state(), BATCHES["improve"])
+    assert {"actor", "critics"} <= differences(after, alive)
+
+
+def test_a_batch_of_ends_alone_leaves_the_actors_output_as_it_is() -> None:
+    ended = edited(BATCHES["improve"], terminated=(slice(None), 1))
+    after, metrics = update("improve")(state(), ended)
+    assert metrics["actor/objective"] == 0
+    assert "actor" not in differences(state(), after) and "critics" in differences(state(), after)
+
+
+def test_a_time_limit_is_not_an_end() -> None:
+    """The last step of a truncated episode bootstraps from its next observation, that of a terminated one does not."""
+    differs = {}
+    for kind in ("truncated", "terminated"):
+        replay = Replay(O, A)
+        rng = np.random.default_rng(0)
+        for step in range(BURN_IN + 1):
+            last = step == BURN_IN
+            observation, action, after = (rng.normal(size=n).astype(np.float32) for n in (O, A, O))
+            replay.add(
+                observation, np.tanh(action), 1.0, after, last and kind == "terminated", last and kind == "truncated"
+            )
+        windows = replay.windows(np.full(BATCH, BURN_IN), agent().phases[-1].sampling)
+        assert windows.valid.all()
+        other = edited(windows, next_observation=((slice(None), -1), 0.3))
+        outcomes = [update("improve")(state(), windows)[0] for windows in (windows, other)]
+        differs[kind] = differences(*outcomes)
+    assert {"actor", "critics"} <= differs["truncated"]
+    assert not differs["terminated"]
+
+
+def test_imagination_goes_on_from_the_buffer_up_to_its_depth() -> None:
+    settings = tuple(PAPER.items())
+    current, depths = state(), []
+    ended = edited(BATCHES["improve"], terminated=((3, -1), 1))
+    for i in range(8):
+        current, _ = update("improve", settings)(current, ended, jax.random.key(i))
+        rows = slice(i * BATCH, (i + 1) * BATCH)
+        depths.append(np.asarray(current.imagined.depth[rows]))
+        alive = np.asarray(current.imagined.weight[rows] > 0)
+        assert (alive == (depths[-1] <= PAPER["imagination_depth"]) & (np.arange(BATCH) != 3)).all()
+    depths = np.stack(depths)
+    assert (depths[0] == 2).all()  # the buffer was empty: all from real states
+    assert (depths[:, 2:] == 2).all()  # the half that always starts there
+    # Started from depth 2 they reach 4 and may be started from again; from 4 they reach 6, too deep to be.
+    assert set(depths[:, :2].ravel()) == {2, 4, 6}
+    assert float(current.imagined.added) == 8 * BATCH and finite(current.imagined)
+
+
+def test_a_share_of_one_imagines_from_real_states_only_while_the_buffer_is_empty() -> None:
+    one = agent((("imagination_ratio", 1.0),))
+    window = one._normalized(state(), jax.tree.map(jnp.asarray, BATCHES["improve"]))
+    start = jax.jit(lambda s: one._start(s, window, key=jax.random.key(0)))
+    np.testing.assert_array_equal(start(state()).observation, window.next_observation[:, -1])
+    full = state().imagined._replace(added=jnp.float32(32), weight=jnp.full(32, 0.5), depth=jnp.full(32, 2.0))
+    started = start(eqx.tree_at(lambda x: x.imagined, state(), full))
+    assert (started.depth == 2).all() and (started.weight == 0.5).all() and not started.observation.any()
+
+
+def test_rewards_reach_the_critics_in_units_of_value_and_the_model_in_its_own() -> None:
+    mixed = jax.tree.map(jnp.asarray, edited(BATCHES["improve"], terminated=((0, -1), 1)))
+    window = agent()._normalized(state(), mixed)
+    reward, scale = np.asarray(mixed.reward), np.asarray(statistics())
+    del scale
+    np.testing.assert_allclose(agent()._real_reward(state(), window), reward[:, -1] / 2.0, rtol=1e-5)
+    np.testing.assert_allclose(window.reward[1:], reward[1:] / 0.8, rtol=1e-5)
+    np.testing.assert_allclose(window.terminal_reward[0, -1], reward[0, -1] / 5.0, rtol=1e-5)
+    assert window.reward[0, -1] == 0 and not window.terminal_reward[1:].any()
+
+
+@pytest.mark.parametrize("progress", [0.0, 0.25, 1.0])
+def test_beta_and_the_spread_of_exploration_follow_the_return(progress: float) -> None:
+    moving = MBDPG(Config(**NETWORKS, **SHAPES, beta=3.0, final_beta=1.0), ENV)
+    prepared = jax.jit(moving.prepare)(state(), statistics(progress))
+    assert float(prepared.beta) == pytest.approx(3 - 2 * progress)
+    assert float(moving.exploration_std(prepared)) == pytest.approx(0.3 - 0.2 * progress)
+    assert moving.policy(prepared)[0] is prepared.actor and moving.policy(prepared)[1] is prepared.normalizer
+    np.testing.assert_allclose(prepared.scales.delta, [0.2, 0.5, 0.5], rtol=1e-6)
+    assert {"normalizer", "scales", "return_scale", "beta", "std"} >= differences(state(), prepared)
+
+
+def test_observation_entries_that_never_change_learn_finitely() -> None:
+    """As Ant's 84 unused contact forces."""
+    replay, rng = Replay(O, A), np.random.default_rng(0)
+    for _ in range(12):
+        observation, after = (np.append(rng.normal(size=O - 1), 7.0).astype(np.float32) for _ in range(2))
+        replay.add(observation, rng.uniform(-1, 1, A).astype(np.float32), 1.0, after, False, False)
+    moments = jax.tree.map(jnp.asarray, replay.statistics(0.0))
+    current = jax.jit(agent().prepare)(fresh(), moments)
+    for name, phase in (("fit", 1), ("improve", 2)):
+        windows = replay.windows(np.arange(4, 4 + BATCH), agent().phases[phase].sampling)
+        current, metrics = update(name)(current, windows)
+        assert finite(current) and finite(metrics)
+
+
+def test_the_same_key_gives_the_same_update_and_another_key_another() -> None:
+    step, given = update("improve"), BATCHES["improve"]
+    once, again, other = (step(state(), given, jax.random.key(i))[0] for i in (1, 1, 2))
+    assert not differences(once, again)
+    assert "critics" in differences(once, other)  # noise on target actions
+
+
+def test_the_instruments_are_finite_and_named_as_documented() -> None:
+    sampling = agent().diagnosis
+    windows = batch(sampling.burn_in + sampling.length)
+    windows = edited(windows, terminated=((0, 9), 1), valid=((0, slice(10, None)), 0))
+    realized = np.float32([1.0, np.nan, 2.0, np.nan])
+    diagnose = jax.jit(lambda s, b, r: agent().diagnose(s, b, r, key=jax.random.key(0)))
+    metrics = diagnose(state(), windows, realized)
+    depths = ("k01", "k05", "k10", "k20")
+    names = {f"dynamics/{name}_{depth}" for name in ("rmse", "persistence") for depth in depths}
+    names |= {"dynamics/survival_imagined", "dynamics/survival_observed", "dynamics/out_of_range"}
+    names |= {"critic/q_bias", "critic/realized_return", "actor/grad_norm_k01"}
+    assert set(metrics) == names
+    assert all(value.shape == () for value in metrics.values()) and finite(metrics)
+    assert float(metrics["dynamics/survival_observed"]) == 0.75
+    assert float(metrics["critic/realized_return"]) == 1.5
+    assert float(metrics["actor/grad_norm_k01"]) > 0
+    moved = state()
+    value = jnp.min(
+        moved.critics(
+            moved.normalizer(jnp.asarray(windows.observation[:, BURN_IN])), jnp.asarray(windows.action[:, BURN_IN])
+        ),
+        axis=0,
+    )
+    assert float(metrics["critic/q_bias"]) == pytest.approx(2.0 * float(value[0] + value[2]) / 2 - 1.5, rel=1e-3)
+
+
+IMPOSSIBLE = [
+    ("horizon", 0),
+    ("batch_size", -1),
+    ("discount", 1.01),
+    ("discount", float("nan")),
+    ("trace", -0.1),
+    ("imagination_ratio", 1.5),
+    ("target_update_rate", 2.0),
+    ("target_update_every", 0),
+    ("actor_learning_rate", 0.0),
+    ("critic_learning_rate", float("inf")),
+    ("actor_clip", 0.0),
+    ("beta", -1.0),
+    ("exploration_std", float("nan")),
+    ("burn_in", -1),
+    ("fit_length", 0),
+    ("gaussians", 0),
+    ("saturation_penalty", -1e-3),
+]
+
+
+@pytest.mark.parametrize(("name", "value"), IMPOSSIBLE)
+def test_an_impossible_setting_is_refused_by_its_flags_name(name: str, value: float) -> None:
+    with pytest.raises(UserError, match="--" + name.replace("_", "-")):
+        Config(**{name: value})
+
+
+@pytest.mark.parametrize(("config", "package"), [(Config, Path(mbdpg.agents.mbdpg.__file__).parent)])
+def test_every_setting_is_read(config: type, package: Path) -> None:
+    read = fields_read(*package.glob("*.py"))
+    assert set(config.__dataclass_fields__) <= read, set(config.__dataclass_fields__) - read
+
+
+def test_every_setting_of_the_schedule_is_read() -> None:
+    package = Path(mbdpg.agents.mbdpg.__file__).parents[2]
+    unread = set(Schedule.__dataclass_fields__) - fields_read(*(package / "training").glob("*.py"), owner="schedule")
+    assert not unread
+
+
+def fields_read(*files: Path, owner: str = "config") -> set[str]:
+    """Names read as attributes of something called `config` (or `c`), `self.config` ..."""
+    owners = {owner, "_" + owner, owner[0]}
+    return {
+        node.attr
+        for path in files
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Attribute)
+        and isinstance(node.ctx, ast.Load)
+        and (getattr(node.value, "id", None) in owners or getattr(node.value, "attr", None) in owners)
+    }
