@@ -28,10 +28,12 @@ DELTA, REWARD, TERMINAL_REWARD = np.array([0.5, 1.0, 2.0]), 0.7, 3.0
 
 
 def affine(rng: np.random.Generator, inputs: int, outputs: int, spread: float = 0.2) -> Linear:
-    """Random weights and bias."""
+    """Random weights and a smaller random bias."""
     linear = Linear(inputs, outputs, key=jax.random.key(0))
-    draw = (jnp.asarray(rng.normal(0, spread, shape), jnp.float32) for shape in ((inputs, outputs), outputs))
-    return eqx.tree_at(lambda x: (x.weight, x.bias), linear, tuple(draw))
+    weight, bias = rng.normal(0, spread, (inputs, outputs)), rng.normal(0, spread / 4, outputs)
+    return eqx.tree_at(
+        lambda x: (x.weight, x.bias), linear, (jnp.asarray(weight, jnp.float32), jnp.asarray(bias, jnp.float32))
+    )
 
 
 def without_layers(network: MLP, output: Linear) -> MLP:

@@ -37,17 +37,19 @@ PAPER = {
 MODES = pytest.mark.parametrize("settings", [(), tuple(PAPER.items())], ids=["default", "paper"])
 
 
-@functools.cache
 def agent(settings: tuple = ()) -> MBDPG:
     return MBDPG(Config(**NETWORKS, **SHAPES, **dict(settings)), ENV)
 
 
 @functools.cache
+def compiled(name: str, settings: tuple) -> Callable[..., Any]:
+    chosen = getattr(agent(settings), name)
+    return jax.jit(lambda state, batch, key: chosen(state, batch, key=key))
+
+
 def update(name: str, settings: tuple = ()) -> Callable[..., tuple[State, dict[str, Any]]]:
     """One compiled update; the agents share their states, whatever their settings."""
-    chosen = getattr(agent(settings), name)
-    compiled = jax.jit(lambda state, batch, key: chosen(state, batch, key=key))
-    return lambda state, batch, seed=0: compiled(state, batch, jax.random.key(seed))
+    return lambda state, batch, seed=0: compiled(name, settings)(state, batch, jax.random.key(seed))
 
 
 @functools.cache

@@ -135,9 +135,7 @@ def test_the_policy_objective_is_eq_18(reward_weights: str, first_value: int) ->
 @pytest.mark.parametrize("beta", [1.0, 3.0])
 @pytest.mark.parametrize("first_value", [0, 1])
 @pytest.mark.parametrize("reward_weights", ["uniform", "remaining"])
-def test_total_weight_of_each_reward_where_values_are_exact(
-    beta: float, first_value: int, reward_weights: str
-) -> None:
+def test_total_weight_of_each_reward_where_values_are_exact(beta: float, first_value: int, reward_weights: str) -> None:
     """methods.md 2.8: how often gamma^k r_{k+1} is counted, directly or inside a value, times the value terms."""
     steps = H + 3
     for k in range(steps):

@@ -56,7 +56,9 @@ def test_weights_start_with_the_spread_of_their_inputs_number(key: jax.Array) ->
 def test_no_two_layers_start_alike(key: jax.Array) -> None:
     mlp = MLP(4, (4, 4), 4, key=key)
     weights = [np.asarray(layer.weight) for layer in (*mlp.hidden, mlp.output)]
-    assert all(np.abs(np.corrcoef(a.ravel(), b.ravel())[0, 1]) < 0.9 for a, b in zip(weights, weights[1:], strict=False))
+    assert all(
+        np.abs(np.corrcoef(a.ravel(), b.ravel())[0, 1]) < 0.9 for a, b in zip(weights, weights[1:], strict=False)
+    )
 
 
 def test_output_scale_zero_starts_as_the_constant_zero(key: jax.Array) -> None:
@@ -72,5 +74,7 @@ def test_layer_norm_of_equal_features_is_its_offset_with_a_finite_gradient() -> 
 
 def test_the_gradient_reaches_every_parameter(key: jax.Array) -> None:
     mlp = MLP(3, (8, 8), 2, key=key)
-    gradient = jax.grad(lambda m, x: jnp.sum(jnp.square(m(x))))(mlp, jnp.asarray(np.random.default_rng(3).normal(size=(5, 3)), jnp.float32))
+    gradient = jax.grad(lambda m, x: jnp.sum(jnp.square(m(x))))(
+        mlp, jnp.asarray(np.random.default_rng(3).normal(size=(5, 3)), jnp.float32)
+    )
     assert all(leaf.any() for leaf in jax.tree.leaves(gradient))

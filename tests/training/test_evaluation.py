@@ -118,7 +118,9 @@ def steps_of(*episodes: tuple[int, str]) -> tuple[Replay, np.ndarray]:
 def test_realized_returns_are_those_of_numpy() -> None:
     replay, reward = steps_of((5, "terminated"), (3, "terminated"))
     expected = [
-        sum(0.9**k * reward[t + k] for k in range(end - t)) for end, rows in ((5, range(5)), (8, range(5, 8))) for t in rows
+        sum(0.9**k * reward[t + k] for k in range(end - t))
+        for end, rows in ((5, range(5)), (8, range(5, 8)))
+        for t in rows
     ]
     found = realized_returns(replay, 0.9)
     assert found.dtype == np.float32

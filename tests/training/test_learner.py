@@ -200,7 +200,9 @@ def test_a_key_is_never_used_twice(toy: Any) -> None:
         pass
 
     learner = Learner(toy.agent(SPEC), [4, 9])
-    nothing = Statistics(*(np.zeros(2, np.float32), np.ones(2, np.float32), np.ones(2, np.float32)), *[np.float32(1)] * 4)
+    nothing = Statistics(
+        *(np.zeros(2, np.float32), np.ones(2, np.float32), np.ones(2, np.float32)), *[np.float32(1)] * 4
+    )
     learner.prepare([nothing, nothing])
     drawn = []
     for phase in learner.agent.phases:

@@ -13,13 +13,13 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from mbdpg.agents import objectives
 from mbdpg.agents.mbdpg import instruments
 from mbdpg.agents.mbdpg.config import Config
-from mbdpg.agents.mbdpg.state import State
+from mbdpg.agents.mbdpg.state import State, initial_state, optimizers
 from mbdpg.dynamics.fitting import Window, dynamics_loss, warm_memory
 from mbdpg.dynamics.imagination import ImaginationBuffer, Trajectory, imagine
-from mbdpg.dynamics.mixture import Memory, MixtureDynamics, Scales
+from mbdpg.dynamics.mixture import Memory, Scales
 from mbdpg.interfaces import Batch, EnvSpec, Metrics, Phase, Sampling, Statistics
 from mbdpg.networks.critic import Critics
-from mbdpg.networks.normalizer import Normalizer, identity
+from mbdpg.networks.normalizer import Normalizer
 from mbdpg.networks.policy import Policy
 
 
@@ -34,23 +34,14 @@ class Start(NamedTuple):
     """Imagined steps since a real state; 0 where it is the state after the batch's own transition."""
 
 
-def optimizer(learning_rate: float, clip: float) -> optax.GradientTransformation:
-    """Adam behind a global-norm clip; a gradient that is not finite is skipped and counted in the state."""
-    return optax.apply_if_finite(
-        optax.chain(optax.clip_by_global_norm(clip), optax.adam(learning_rate)), max_consecutive_errors=10**9
-    )
-
-
 class MBDPG:
     """Algorithm 1: `clone` is line 3, `fit` line 7 and `improve` lines 11 to 14."""
 
     def __init__(self, config: Config, env: EnvSpec):
         self.config = config
         self.env = env
+        self._optimizers = optimizers(config)
         c = config
-        self._dynamics_optimizer = optimizer(c.dynamics_learning_rate, c.dynamics_clip)
-        self._actor_optimizer = optimizer(c.actor_learning_rate, c.actor_clip)
-        self._critic_optimizer = optimizer(c.critic_learning_rate, c.critic_clip)
         fitted = Sampling(c.fit_batch_size, c.burn_in, c.fit_length)
         cloned = Sampling(c.batch_size, burn_in=0, length=1, demonstrated=True)
         improved = Sampling(c.batch_size, c.burn_in, length=1)
@@ -62,31 +53,7 @@ class MBDPG:
 
     def init(self, *, key: PRNGKeyArray) -> State:
         """Fresh networks; targets equal to what they follow."""
-        c, o, a = self.config, self.env.observation_size, self.env.action_size
-        widths = (c.width,) * 3
-        dynamics_key, actor_key, critic_key = jax.random.split(key, 3)
-        dynamics = MixtureDynamics(o, a, gaussians=c.gaussians, memory=c.memory, widths=widths, key=dynamics_key)
-        actor = Policy(o, a, widths, key=actor_key)
-        critics = Critics(o, a, widths, key=critic_key)
-        one = jnp.ones(())
-        slots = 8 * c.batch_size
-        return State(
-            dynamics=dynamics,
-            actor=actor,
-            critics=critics,
-            target_actor=jax.tree.map(jnp.copy, actor),
-            target_critics=jax.tree.map(jnp.copy, critics),
-            dynamics_optimizer=self._dynamics_optimizer.init(dynamics),
-            actor_optimizer=self._actor_optimizer.init(actor),
-            critic_optimizer=self._critic_optimizer.init(critics),
-            normalizer=identity(o),
-            scales=Scales(jnp.ones(o), one, one),
-            return_scale=one,
-            imagined=ImaginationBuffer.empty(slots, o, dynamics.initial_memory((slots,))),
-            beta=jnp.asarray(c.beta, jnp.float32),
-            std=jnp.asarray(c.exploration_std, jnp.float32),
-            critic_steps=jnp.zeros(()),
-        )
+        return initial_state(self.config, self.env, self._optimizers, key=key)
 
     def prepare(self, state: State, statistics: Statistics) -> State:
         """Take over the replay's scales; beta and the behavior policy's spread follow the return (Section 4.3.2)."""
@@ -127,7 +94,7 @@ class MBDPG:
             likelihood=c.likelihood,
             mean_weight=c.mean_weight,
         )
-        updates, memory = self._dynamics_optimizer.update(gradient, state.dynamics_optimizer)
+        updates, memory = self._optimizers.dynamics.update(gradient, state.dynamics_optimizer)
         dynamics = optax.apply_updates(state.dynamics, updates)
         metrics |= {"dynamics/grad_norm": optax.tree.norm(gradient), "dynamics/skipped": memory.total_notfinite}
         return eqx.tree_at(lambda x: (x.dynamics, x.dynamics_optimizer), state, (dynamics, memory)), metrics
@@ -217,7 +184,7 @@ class MBDPG:
     def _step_critics(self, state: State, gradient: Critics) -> State:
         """Step the critics, then let the targets follow every C-th time."""
         c = self.config
-        updates, memory = self._critic_optimizer.update(gradient, state.critic_optimizer)
+        updates, memory = self._optimizers.critic.update(gradient, state.critic_optimizer)
         critics = optax.apply_updates(state.critics, updates)
         count = state.critic_steps + 1.0
         rate = jnp.where(jnp.mod(count, c.target_update_every) == 0.0, c.target_update_rate, 0.0)
@@ -229,7 +196,7 @@ class MBDPG:
         )
 
     def _step_actor(self, state: State, gradient: Policy) -> State:
-        updates, memory = self._actor_optimizer.update(gradient, state.actor_optimizer)
+        updates, memory = self._optimizers.actor.update(gradient, state.actor_optimizer)
         actor = optax.apply_updates(state.actor, updates)
         return eqx.tree_at(lambda x: (x.actor, x.actor_optimizer), state, (actor, memory))
 

@@ -1,16 +1,21 @@
-"""What MBDPG's learning changes."""
+"""What MBDPG's learning changes, and how it begins."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
-from jaxtyping import Array, Float
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, PRNGKeyArray
 
+from mbdpg.agents.mbdpg.config import Config
 from mbdpg.dynamics.imagination import ImaginationBuffer
 from mbdpg.dynamics.mixture import MixtureDynamics, Scales
+from mbdpg.interfaces import EnvSpec
 from mbdpg.networks.critic import Critics
-from mbdpg.networks.normalizer import Normalizer
+from mbdpg.networks.normalizer import Normalizer, identity
 from mbdpg.networks.policy import Policy
 
 
@@ -35,3 +40,53 @@ class State(eqx.Module):
     """Of the behavior policy."""
     critic_steps: Float[Array, ""]
     """Critic updates so far."""
+
+
+class Optimizers(NamedTuple):
+    """One per network."""
+
+    dynamics: optax.GradientTransformation
+    actor: optax.GradientTransformation
+    critic: optax.GradientTransformation
+
+
+def optimizers(config: Config) -> Optimizers:
+    """Adam behind a global-norm clip; a gradient that is not finite is skipped and counted."""
+
+    def one(learning_rate: float, clip: float) -> optax.GradientTransformation:
+        return optax.apply_if_finite(
+            optax.chain(optax.clip_by_global_norm(clip), optax.adam(learning_rate)), max_consecutive_errors=10**9
+        )
+
+    return Optimizers(
+        dynamics=one(config.dynamics_learning_rate, config.dynamics_clip),
+        actor=one(config.actor_learning_rate, config.actor_clip),
+        critic=one(config.critic_learning_rate, config.critic_clip),
+    )
+
+
+def initial_state(config: Config, env: EnvSpec, optimizers: Optimizers, *, key: PRNGKeyArray) -> State:
+    """Fresh networks; targets equal to what they follow."""
+    o, a, widths = env.observation_size, env.action_size, (config.width,) * 3
+    dynamics_key, actor_key, critic_key = jax.random.split(key, 3)
+    dynamics = MixtureDynamics(o, a, gaussians=config.gaussians, memory=config.memory, widths=widths, key=dynamics_key)
+    actor = Policy(o, a, widths, key=actor_key)
+    critics = Critics(o, a, widths, key=critic_key)
+    one, slots = jnp.ones(()), 8 * config.batch_size
+    return State(
+        dynamics=dynamics,
+        actor=actor,
+        critics=critics,
+        target_actor=jax.tree.map(jnp.copy, actor),
+        target_critics=jax.tree.map(jnp.copy, critics),
+        dynamics_optimizer=optimizers.dynamics.init(dynamics),
+        actor_optimizer=optimizers.actor.init(actor),
+        critic_optimizer=optimizers.critic.init(critics),
+        normalizer=identity(o),
+        scales=Scales(jnp.ones(o), one, one),
+        return_scale=one,
+        imagined=ImaginationBuffer.empty(slots, o, dynamics.initial_memory((slots,))),
+        beta=jnp.asarray(config.beta, jnp.float32),
+        std=jnp.asarray(config.exploration_std, jnp.float32),
+        critic_steps=jnp.zeros(()),
+    )
