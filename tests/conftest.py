@@ -1,6 +1,10 @@
 """What every test runs under: CPU, one thread per native library, strict JAX, shapes and types checked at each call."""
 
 import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
 
 # Before JAX and NumPy are imported. Inherited by the programs that tests start; set from outside, a value stays.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
@@ -38,3 +42,58 @@ optax.tree.bias_correction = bias_correction
 @pytest.fixture
 def key() -> jax.Array:
     return jax.random.key(0)
+
+
+ROOT = Path(__file__).resolve().parent.parent
+EVERY_100 = ("--evaluate-every", "100", "--evaluation-episodes", "1", "--log-every", "100", "--checkpoint-every", "100")
+SMALL = ("--width", "8", "--batch-size", "8", "--random-steps", "100", *EVERY_100)
+FLAGS = {
+    "td3": ("--algorithm", "td3", *SMALL),
+    "mbdpg": (
+        *("--algorithm", "mbdpg", *SMALL, "--memory", "8", "--gaussians", "2", "--horizon", "2", "--burn-in", "2"),
+        *("--fit-length", "2", "--fit-batch-size", "8", "--pretraining-fits", "10"),
+    ),
+}
+
+Mbdpg = Callable[..., "subprocess.Popen[str]"]
+
+
+@pytest.fixture(scope="session")
+def mbdpg_command(tmp_path_factory: pytest.TempPathFactory) -> Mbdpg:
+    """Starts `python -m mbdpg ...`; what one such program compiles, the next ones find."""
+    cache = tmp_path_factory.getbasetemp() / "compiled"
+    environment = os.environ | {
+        "PYTHONPATH": str(ROOT),
+        "JAX_COMPILATION_CACHE_DIR": str(cache),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "0",
+    }
+
+    def start(*arguments: str | Path) -> "subprocess.Popen[str]":
+        return subprocess.Popen(
+            [sys.executable, "-m", "mbdpg", *map(str, arguments)],
+            cwd=cache.parent,  # where nothing of the checkout is found by accident
+            env=environment,
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
+
+    return start
+
+
+@pytest.fixture(scope="session")
+def trained(mbdpg_command: Mbdpg, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a finished run of 400 steps of TD3 on Pendulum-v1; not to be changed."""
+    out = tmp_path_factory.mktemp("trained")
+    program = mbdpg_command("train", "Pendulum-v1", *FLAGS["td3"], "--steps", "400", "--out", out)
+    stdout, stderr = program.communicate()
+    assert program.returncode == 0, stderr
+    assert f"next: mbdpg evaluate {out / 'seed-0'}" in stdout
+    return out / "seed-0"
+
+
+@pytest.fixture(scope="session")
+def flags() -> dict[str, tuple[str, ...]]:
+    """The smallest run of each algorithm that has everything in it; --steps is missing."""
+    return FLAGS

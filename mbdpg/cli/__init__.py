@@ -34,6 +34,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except BrokenPipeError:  # whoever read our output has seen enough
         sys.stderr.close()
         sys.exit(1)
+    except KeyboardInterrupt:  # where there is nothing to save
+        sys.exit(130)
     except Exception as error:
         if "--debug" in args:
             raise

@@ -26,13 +26,14 @@ def parse(kind: type[Any], verb: str, args: Sequence[str]) -> Any:
 
 
 def peek(args: Sequence[str], flag: str, default: str) -> str:
-    """A flag's value before the rest can be parsed, because the rest depends on it."""
+    """A flag's value before the rest can be parsed, because the rest depends on it; of several, the last."""
+    found = default
     for position, arg in enumerate(args):
         if arg == f"--{flag}" and position + 1 < len(args):
-            return args[position + 1]
-        if arg.startswith(f"--{flag}="):
-            return arg.split("=", 1)[1]
-    return default
+            found = args[position + 1]
+        elif arg.startswith(f"--{flag}="):
+            found = arg.split("=", 1)[1]
+    return found
 
 
 def one_line(text: str) -> str:

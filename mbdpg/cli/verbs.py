@@ -195,6 +195,8 @@ def _demonstrate(args: list[str]) -> None:
 
 def make_demonstrations(flags: Demonstrate) -> None:
     """Train the expert unless there is one, then record."""
+    require(flags.episodes >= 1, f"--episodes is {flags.episodes}, expected at least 1")
+    success = expert.success_in(flags.env, flags.env_options, flags.success_return)
     run = flags.expert
     if run is None:
         folder = flags.out.parent / f"{flags.out.stem}-expert"
@@ -210,7 +212,7 @@ def make_demonstrations(flags: Demonstrate) -> None:
         flags.env,
         flags.env_options,
         episodes=flags.episodes,
-        success_return=flags.success_return,
+        success_return=success,
         seed=flags.seed,
     )
     found.save(flags.out)

@@ -8,7 +8,7 @@ from mbdpg.experiments.config import EnvOptions, RunConfig
 from mbdpg.experiments.presets import agent_config
 from mbdpg.experiments.run import load_policy, policy_facts
 from mbdpg.imitation.demonstrations import Demonstrations, record
-from mbdpg.interfaces import UserError, require
+from mbdpg.interfaces import UserError
 from mbdpg.training.loop import Schedule
 
 
@@ -17,13 +17,27 @@ def config_of(env: str, steps: int, env_options: EnvOptions) -> RunConfig:
     return RunConfig(env, "td3", agent_config("td3", "default"), Schedule(steps=steps), env_options)
 
 
+def success_in(env: str, env_options: EnvOptions, given: float | None) -> float:
+    """Least return of a success: what is given, or else the environment's reference return.
+
+    Raises:
+        UserError: nobody knows, or there is no such environment.
+    """
+    made = RunConfig(env, env_options=env_options).make_env()
+    made.close()
+    success = made.spec.reference_return if given is None else given
+    if success is None:
+        raise UserError(f"nobody knows what a success in {env} is; say so with --success-return")
+    return success
+
+
 def record_from(
     run: Path,
     env: str,
     env_options: EnvOptions,
     *,
     episodes: int,
-    success_return: float | None,
+    success_return: float,
     seed: int,
 ) -> Demonstrations:
     """Record successful episodes of a run's best policy, by whatever algorithm it was trained.
@@ -33,24 +47,20 @@ def record_from(
         env: Gymnasium id to record in.
         env_options: how it is made.
         episodes: successes to record.
-        success_return: least return of a success; None for the environment's reference return.
+        success_return: least return of a success.
         seed: decides the episodes.
 
     Raises:
-        UserError: nobody knows what a success is, or there was none.
+        UserError: there was no success, or the policy is for another environment.
     """
-    require(episodes >= 1, f"--episodes is {episodes}, expected at least 1")
     made = RunConfig(env, env_options=env_options).make_env()
     try:
-        success = made.spec.reference_return if success_return is None else success_return
-        if success is None:
-            raise UserError(f"nobody knows what a success in {env} is; say so with --success-return")
         policy = load_policy(run, best=True, spec=made.spec)
         return record(
             made,
             policy,
             episodes=episodes,
-            success_return=success,
+            success_return=success_return,
             expert_env_steps=int(policy_facts(run)["env_steps"]),
             seed=seed,
         )

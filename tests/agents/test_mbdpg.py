@@ -1,9 +1,7 @@
 """What each update of MBDPG moves, what it must not, and what it does with odd data."""
 
-import ast
 import functools
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -12,10 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import mbdpg.agents.mbdpg
 from mbdpg.agents.mbdpg import MBDPG, Config, State
-from mbdpg.interfaces import Batch, EnvSpec, Statistics, UserError
-from mbdpg.training.loop import Schedule
+from mbdpg.interfaces import Batch, EnvSpec, Statistics
 from mbdpg.training.replay import Replay
 
 O, A, BATCH, BURN_IN, LENGTH = 3, 2, 4, 2, 3
@@ -336,55 +332,3 @@ def test_the_instruments_are_finite_and_named_as_documented() -> None:
         axis=0,
     )
     assert float(metrics["critic/q_bias"]) == pytest.approx(2.0 * float(value[0] + value[2]) / 2 - 1.5, rel=1e-3)
-
-
-IMPOSSIBLE = [
-    ("horizon", 0),
-    ("batch_size", -1),
-    ("discount", 1.01),
-    ("discount", float("nan")),
-    ("trace", -0.1),
-    ("imagination_ratio", 1.5),
-    ("target_update_rate", 2.0),
-    ("target_update_every", 0),
-    ("actor_learning_rate", 0.0),
-    ("critic_learning_rate", float("inf")),
-    ("actor_clip", 0.0),
-    ("beta", -1.0),
-    ("exploration_std", float("nan")),
-    ("burn_in", -1),
-    ("fit_length", 0),
-    ("gaussians", 0),
-    ("saturation_penalty", -1e-3),
-]
-
-
-@pytest.mark.parametrize(("name", "value"), IMPOSSIBLE)
-def test_an_impossible_setting_is_refused_by_its_flags_name(name: str, value: float) -> None:
-    with pytest.raises(UserError, match="--" + name.replace("_", "-")):
-        Config(**{name: value})
-
-
-@pytest.mark.parametrize(("config", "package"), [(Config, Path(mbdpg.agents.mbdpg.__file__).parent)])
-def test_every_setting_is_read(config: type, package: Path) -> None:
-    read = fields_read(*package.glob("*.py"))
-    assert set(config.__dataclass_fields__) <= read, set(config.__dataclass_fields__) - read
-
-
-def test_every_setting_of_the_schedule_is_read() -> None:
-    package = Path(mbdpg.agents.mbdpg.__file__).parents[2]
-    unread = set(Schedule.__dataclass_fields__) - fields_read(*(package / "training").glob("*.py"), owner="schedule")
-    assert not unread
-
-
-def fields_read(*files: Path, owner: str = "config") -> set[str]:
-    """Names read as attributes of something called `config` (or `c`), `self.config` ..."""
-    owners = {owner, "_" + owner, owner[0]}
-    return {
-        node.attr
-        for path in files
-        for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.Attribute)
-        and isinstance(node.ctx, ast.Load)
-        and (getattr(node.value, "id", None) in owners or getattr(node.value, "attr", None) in owners)
-    }

@@ -133,6 +133,19 @@ class Toy(NamedTuple):
     training: Callable[..., tuple[Training, list[ToyRecorder]]]
 
 
+COMPILED: dict[tuple[int, ...], tuple[Learner, list[dict[str, np.ndarray]]]] = {}
+
+
+def toy_learner(seeds: Sequence[int]) -> Learner:
+    """A fresh learner of the standard agent; compiled once, so that there is one at a time."""
+    if tuple(seeds) not in COMPILED:
+        learner = Learner(ToyAgent(ToyEnv.spec), seeds)
+        COMPILED[tuple(seeds)] = learner, [learner.snapshot(index) for index in range(len(seeds))]
+    learner, fresh = COMPILED[tuple(seeds)]
+    learner.restore(fresh)
+    return learner
+
+
 def toy_training(
     seeds: Sequence[int] = (0,),
     *,
@@ -141,15 +154,15 @@ def toy_training(
     evaluation_env: ToyEnv | None = None,
     replay: Replay | None = None,
 ) -> tuple[Training, list[ToyRecorder]]:
-    agent = agent or ToyAgent(ToyEnv.spec)
+    learner = toy_learner(seeds) if agent is None else Learner(agent, seeds)
     schedule = schedule or Schedule(
         steps=60, cycle=5, evaluate_every=20, evaluation_episodes=2, log_every=10, checkpoint_every=30
     )
     recorders = [ToyRecorder() for _ in seeds]
     collectors = [
-        Collector(ToyEnv, seed, replay or Replay(2, 1), random_steps=agent.config.random_steps) for seed in seeds
+        Collector(ToyEnv, seed, replay or Replay(2, 1), random_steps=learner.agent.config.random_steps)
+        for seed in seeds
     ]
-    learner = Learner(agent, seeds)
     return Training(learner, collectors, evaluation_env or ToyEnv(), recorders, schedule), recorders
 
 

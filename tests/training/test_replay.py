@@ -93,7 +93,7 @@ def test_the_oldest_and_the_newest_step_are_drawn_as_often_as_any_other() -> Non
     counts = np.bincount(batch.observation[..., 0, 0].astype(int).ravel(), minlength=19)
     assert len(counts) == 19
     # 1000 each, standard deviation 31.
-    assert 860 < counts.min() and counts.max() < 1140
+    assert counts.min() > 860 and counts.max() < 1140
 
 
 def test_sampling_is_a_function_of_its_generator() -> None:

@@ -1,0 +1,82 @@
+"""Settings of agents and of the loop: impossible ones are refused, and none is without effect."""
+
+import ast
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+import mbdpg
+from mbdpg.agents import mbdpg as model_based, td3
+from mbdpg.interfaces import UserError
+from mbdpg.training.loop import Schedule
+
+PACKAGE = Path(mbdpg.__file__).parent
+
+SHARES = [("discount", 1.01), ("discount", -0.1), ("discount", float("nan")), ("target_update_rate", 2.0)]
+IMPOSSIBLE = [
+    *((model_based.Config, name, value) for name, value in SHARES),
+    *((td3.Config, name, value) for name, value in SHARES),
+    (model_based.Config, "horizon", 0),
+    (model_based.Config, "batch_size", -1),
+    (model_based.Config, "trace", -0.1),
+    (model_based.Config, "imagination_ratio", 1.5),
+    (model_based.Config, "target_update_every", 0),
+    (model_based.Config, "actor_learning_rate", 0.0),
+    (model_based.Config, "critic_learning_rate", float("inf")),
+    (model_based.Config, "actor_clip", 0.0),
+    (model_based.Config, "beta", -1.0),
+    (model_based.Config, "exploration_std", float("nan")),
+    (model_based.Config, "burn_in", -1),
+    (model_based.Config, "fit_length", 0),
+    (model_based.Config, "gaussians", 0),
+    (model_based.Config, "saturation_penalty", -1e-3),
+    (td3.Config, "policy_delay", 0),
+    (td3.Config, "target_noise", -0.1),
+    (td3.Config, "width", 0),
+]
+
+
+@pytest.mark.parametrize(("config", "name", "value"), IMPOSSIBLE)
+def test_an_impossible_setting_is_refused_by_its_flags_name(config: type, name: str, value: float) -> None:
+    with pytest.raises(UserError, match="--" + name.replace("_", "-")):
+        config(**{name: value})
+
+
+@pytest.mark.parametrize("values", [{"steps": 0}, {"steps": 120}, {"cycle": 0}, {"evaluation_episodes": 0}])
+def test_an_impossible_schedule_is_refused(values: dict[str, int]) -> None:
+    with pytest.raises(UserError, match=next(iter(values))):
+        Schedule(**values)
+
+
+def unread(config: type, files: list[Path], owners: set[str]) -> set[str]:
+    """Fields that are nowhere read as an attribute of something with one of these names."""
+    read = {
+        node.attr
+        for path in files
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Attribute)
+        and isinstance(node.ctx, ast.Load)
+        and (getattr(node.value, "id", None) in owners or getattr(node.value, "attr", None) in owners)
+    }
+    return {field.name for field in dataclasses.fields(config)} - read
+
+
+@pytest.mark.parametrize(
+    ("config", "files", "owners"),
+    [
+        (model_based.Config, sorted((PACKAGE / "agents" / "mbdpg").glob("*.py")), {"c", "config"}),
+        (td3.Config, [PACKAGE / "agents" / "td3.py"], {"c", "config"}),
+        (Schedule, [PACKAGE / "training" / "loop.py"], {"schedule", "_schedule"}),
+    ],
+    ids=["mbdpg", "td3", "schedule"],
+)
+def test_every_setting_is_read(config: type, files: list[Path], owners: set[str]) -> None:
+    assert not unread(config, files, owners)
+
+
+def test_the_rule_above_sees(tmp_path: Path) -> None:
+    code = tmp_path / "loop.py"
+    code.write_text("self.schedule.steps\nschedule.cycle\nother.log_every\nself.schedule.checkpoint_every = 3\n")
+    names = {field.name for field in dataclasses.fields(Schedule)}
+    assert unread(Schedule, [code], {"schedule"}) == names - {"steps", "cycle"}

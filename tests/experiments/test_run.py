@@ -1,0 +1,361 @@
+"""A run that was killed, stopped or damaged, and resumed, leaves the bytes of one that was left alone."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import random
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mbdpg.agents import td3
+from mbdpg.experiments import run
+from mbdpg.experiments.config import EnvOptions, RunConfig
+from mbdpg.interfaces import EnvSpec, Step, UserError
+from mbdpg.storage import RunFolder
+from mbdpg.training.loop import Schedule
+
+Start = Callable[..., "subprocess.Popen[str]"]
+LUNAR = "LunarLanderContinuous-v3"
+STEPS = 400
+
+
+def contents(folder: Path) -> dict[str, Any]:
+    """Everything that a run leaves but for what depends on the clock: by file name, bytes or JSON."""
+    found: dict[str, Any] = {}
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        if not path.is_file() or name.startswith("tensorboard/") or name in ("lock", "timings.jsonl", "config.json"):
+            continue
+        found[name] = path.read_bytes()
+        if path.suffix == ".json":
+            found[name] = json.loads(path.read_text())
+        if path.name == "facts.json":
+            del found[name]["recorder"]["offsets"]["timings.jsonl"]
+        if path.name == "manifest.json":  # has the hash of facts.json
+            found[name]["files"] = [file for file in found[name]["files"] if file["name"] != "facts.json"]
+    return found
+
+
+def check_equal(found: Path, expected: Path) -> None:
+    left, right = contents(found), contents(expected)
+    assert left.keys() == right.keys()
+    assert {f"checkpoints/{STEPS:09d}/state.safetensors", "metrics.jsonl", "policy/best.safetensors"} <= left.keys()
+    assert [name for name in left if left[name] != right[name]] == []
+
+
+def rows(folder: Path) -> int:
+    path = folder / "metrics.jsonl"
+    return path.read_bytes().count(b"\n") if path.exists() else 0
+
+
+def finish(program: subprocess.Popen[str], status: int = 0) -> str:
+    _, stderr = program.communicate()
+    assert program.returncode == status, stderr
+    return stderr
+
+
+def kill_after(program: subprocess.Popen[str], folder: Path, count: int, seconds: float) -> None:
+    """Wait for a number of rows of metrics, then some moments, then kill -9."""
+    while rows(folder) < count and program.poll() is None:
+        time.sleep(0.002)
+    time.sleep(seconds)
+    program.send_signal(signal.SIGKILL)
+    program.communicate()
+
+
+@pytest.fixture(scope="session")
+def reference(
+    mbdpg_command: Start, trained: Path, flags: dict[str, tuple[str, ...]], tmp_path_factory: pytest.TempPathFactory
+) -> Callable[[str, str], Path]:
+    """Runs that nobody disturbed, each made once."""
+    made = {("td3", "Pendulum-v1"): trained}
+
+    def folder(algorithm: str, env: str) -> Path:
+        if (algorithm, env) not in made:
+            out = tmp_path_factory.mktemp("reference")
+            finish(mbdpg_command("train", env, *flags[algorithm], "--steps", str(STEPS), "--out", out))
+            made[algorithm, env] = out / "seed-0"
+        return made[algorithm, env]
+
+    return folder
+
+
+EVERY_CASE = [("td3", "Pendulum-v1"), ("td3", LUNAR), ("mbdpg", "Pendulum-v1"), ("mbdpg", LUNAR)]
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "env", "kills"),
+    [
+        ("td3", LUNAR, [4, 6]),
+        ("mbdpg", "Pendulum-v1", [2, 5]),
+        *(pytest.param(*case, [0, 2, 4, 6, 8], marks=pytest.mark.slow) for case in EVERY_CASE),
+    ],
+)
+def test_killed_at_random_moments_and_resumed_it_ends_with_the_same_bytes(
+    mbdpg_command: Start, reference: Any, flags: Any, tmp_path: Path, algorithm: str, env: str, kills: list[int]
+) -> None:
+    expected = reference(algorithm, env)
+    folder, seed = tmp_path / "seed-0", time.time_ns()
+    chance = random.Random(seed)
+    print(f"moments are drawn from seed {seed}")
+    program = mbdpg_command("train", env, *flags[algorithm], "--steps", str(STEPS), "--out", tmp_path)
+    for count in kills:
+        kill_after(program, folder, count, chance.uniform(0, 0.2))
+        if not (folder / "checkpoints").is_dir():  # before the first one there is nothing to resume
+            shutil.rmtree(tmp_path)
+            program = mbdpg_command("train", env, *flags[algorithm], "--steps", str(STEPS), "--out", tmp_path)
+        else:
+            program = mbdpg_command("resume", folder)
+    finish(program)
+    check_equal(folder, expected)
+    if env == LUNAR:  # its episodes end early, so that some ended before the cuts and some were open
+        assert json.loads((expected / "metrics.jsonl").read_text().splitlines()[-1])["train/episodes"] >= 3
+
+
+def test_sigterm_saves_says_how_to_go_on_and_a_second_process_is_kept_out_meanwhile(
+    mbdpg_command: Start, reference: Any, flags: Any, tmp_path: Path
+) -> None:
+    folder = tmp_path / "seed-0"
+    program = mbdpg_command("train", "Pendulum-v1", *flags["td3"], "--steps", str(STEPS), "--out", tmp_path)
+    while rows(folder) < 3:
+        time.sleep(0.002)
+    program.send_signal(signal.SIGSTOP)  # else it might be done before the second one looks
+    said = finish(mbdpg_command("resume", folder), status=1)
+    assert said.count("\n") == 1
+    assert f"{folder} is in use by pid {program.pid} on host" in said
+    program.send_signal(signal.SIGTERM)
+    program.send_signal(signal.SIGCONT)
+    said = finish(program, status=143)
+    assert "mbdpg: saving, then stopping" in said
+    assert said.endswith(f"mbdpg: saved; go on with: mbdpg resume {tmp_path}\n")
+    assert rows(folder) < rows(reference("td3", "Pendulum-v1"))
+    finish(mbdpg_command("resume", tmp_path))
+    check_equal(folder, reference("td3", "Pendulum-v1"))
+
+
+def test_ctrl_c_exits_with_130_and_a_second_one_at_once(mbdpg_command: Start, flags: Any, tmp_path: Path) -> None:
+    program = mbdpg_command("train", "Pendulum-v1", *flags["td3"], "--steps", "100000", "--out", tmp_path)
+    while rows(tmp_path / "seed-0") < 3:
+        time.sleep(0.002)
+    program.send_signal(signal.SIGSTOP)
+    program.send_signal(signal.SIGINT)
+    program.send_signal(signal.SIGCONT)
+    said = finish(program, status=130)
+    assert f"mbdpg resume {tmp_path}" in said and "Traceback" not in said
+
+
+def test_a_damaged_newest_checkpoint_is_said_loudly_and_the_run_still_ends_with_the_same_bytes(
+    mbdpg_command: Start, trained: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "seed-0"
+    shutil.copytree(trained, folder)
+    newest = folder / "checkpoints" / f"{STEPS:09d}" / "state.safetensors"
+    data = bytearray(newest.read_bytes())
+    data[len(data) // 2] ^= 1
+    newest.write_bytes(data)
+    said = finish(mbdpg_command("resume", folder))
+    assert f"WARNING: skipping checkpoint {STEPS:09d}: {newest} has changed since it was written" in said
+    check_equal(folder, trained)
+
+
+def test_seeds_in_one_process_leave_the_bytes_that_each_leaves_alone(
+    mbdpg_command: Start, trained: Path, flags: Any, tmp_path: Path
+) -> None:
+    together = ("--seeds", "0", "3", "--steps", str(STEPS), "--out", tmp_path)
+    finish(mbdpg_command("train", "Pendulum-v1", *flags["td3"], *together))
+    check_equal(tmp_path / "seed-0", trained)
+    assert contents(tmp_path / "seed-3")["metrics.jsonl"] != contents(trained)["metrics.jsonl"]
+
+
+# In this process, with an environment of our own: what does not need a kill.
+
+
+class Toy:
+    """Three observations, episodes of ten steps."""
+
+    spec = EnvSpec("Toy-v0", observation_size=3, action_size=1, episode_limit=10, reference_return=None)
+
+    def __init__(self, fault: Callable[[], None] = lambda: None) -> None:
+        self._fault = fault
+        self._place, self._taken = np.zeros(3), 0
+
+    def reset(self, *, seed: int) -> np.ndarray:
+        self._place, self._taken = np.random.default_rng(seed).normal(size=3), 0
+        return self._place.astype(np.float32)
+
+    def step(self, action: np.ndarray) -> Step:
+        self._fault()
+        self._place, self._taken = self._place * 0.9 + 0.1 * float(action[0]), self._taken + 1
+        return Step(self._place.astype(np.float32), -float(np.abs(self._place).sum()), False, self._taken == 10)
+
+    def render(self) -> np.ndarray:
+        raise NotImplementedError
+
+    def close(self) -> None:
+        pass
+
+
+TOY = RunConfig(
+    "Toy-v0",
+    "td3",
+    td3.Config(width=4, batch_size=4, random_steps=20),
+    Schedule(steps=40, cycle=10, evaluate_every=20, evaluation_episodes=1, log_every=20, checkpoint_every=20),
+)
+
+
+@pytest.fixture(scope="module")
+def toy_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return run.train(TOY, seeds=[0], out=tmp_path_factory.mktemp("toy"), make_env=Toy)[0]
+
+
+def edited(source: Path, target: Path, **changes: Any) -> Path:
+    """A copy of a run with another config.json; a change to None takes the field out."""
+    shutil.copytree(source, target)
+    whole = json.loads((target / "config.json").read_text())
+    whole["run"] = {name: value for name, value in (whole["run"] | changes).items() if value is not None}
+    (target / "config.json").write_text(json.dumps(whole))
+    return target
+
+
+def test_config_json_has_everything_that_decided_the_run(toy_run: Path) -> None:
+    config = RunFolder.open(toy_run).config
+    assert RunConfig.from_json(config) == TOY
+    assert config["seed"] == 0 and config["custom_env"] is True
+    assert {"commit", "machine"} <= config.keys()
+
+
+def test_a_longer_run_begins_where_the_shorter_ended(toy_run: Path, tmp_path: Path) -> None:
+    folder = edited(toy_run, tmp_path / "longer")
+    before = (folder / "metrics.jsonl").read_bytes()
+    with pytest.raises(UserError, match="--steps is 20, less than the run's own 40"):
+        run.resume(folder, make_env=Toy, steps=20)
+    run.resume(folder, make_env=Toy, steps=60)
+    assert (folder / "metrics.jsonl").read_bytes().startswith(before)
+    assert (folder / "checkpoints" / "000000060").is_dir()
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"algorithm": "ppo"}, "config.json has algorithm 'ppo', expected mbdpg, td3"),
+        ({"env": None}, "does not say which environment"),
+        ({"agent": None}, "config.json has no agent"),
+        ({"agent": {"width": 4}}, "config.json does not fit this version of mbdpg: agent differs in"),
+        ({"seed": "0"}, "has seed '0' in its config.json"),
+        ({"seed": -1}, "has seed -1"),
+        ({"agent": dataclasses.asdict(TOY.agent) | {"width": "4"}}, "config.json has agent.width = '4'"),
+        ({"agent": dataclasses.asdict(TOY.agent) | {"width": 0}}, "--width is 0, expected a number above 0"),
+        (
+            {"agent": dataclasses.asdict(TOY.agent) | {"width": 8}},
+            "the checkpoint does not fit this configuration: actor/mlp/hidden/0/weight is float32[3, 4], "
+            "expected float32[3, 8]",
+        ),
+        ({"demonstrations": 3}, "config.json has odd demonstrations"),
+    ],
+    ids=lambda value: "" if isinstance(value, dict) else value[:40],
+)
+def test_a_changed_config_is_refused_in_one_line(
+    toy_run: Path, tmp_path: Path, changes: dict[str, Any], said: str
+) -> None:
+    folder = edited(toy_run, tmp_path / "changed", **changes)
+    before = contents(folder)
+    with pytest.raises(UserError) as caught:
+        run.resume(folder, make_env=Toy)
+    assert said in str(caught.value) and "\n" not in str(caught.value)
+    assert contents(folder) == before
+
+
+def test_another_environment_than_the_run_s_is_refused(toy_run: Path, tmp_path: Path) -> None:
+    class Wider(Toy):
+        spec = dataclasses.replace(Toy.spec, observation_size=4)
+
+    with pytest.raises(UserError, match="does not fit this configuration"):
+        run.resume(edited(toy_run, tmp_path / "run"), make_env=Wider)
+
+
+def test_a_run_folder_never_decides_that_code_is_imported(toy_run: Path, tmp_path: Path, monkeypatch: Any) -> None:
+    (tmp_path / "hostile.py").write_text("raise SystemExit('imported')")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    options = dataclasses.asdict(EnvOptions(allow_import=True))
+    folder = edited(toy_run, tmp_path / "run", env="hostile:Toy-v0", env_options=options, custom_env=False)
+    with pytest.raises(UserError, match="would run the code of the module hostile"):
+        run.resume(folder)
+
+
+def test_a_run_that_could_not_begin_leaves_no_folder(tmp_path: Path) -> None:
+    (tmp_path / "new" / "seed-1").mkdir(parents=True)
+    (tmp_path / "new" / "seed-1" / "mine.txt").write_text("mine")
+    with pytest.raises(UserError, match="seed-1 is not empty"):
+        run.train(TOY, seeds=[0, 1], out=tmp_path / "new", make_env=Toy)
+    assert [path.name for path in (tmp_path / "new").rglob("*")] == ["seed-1", "mine.txt"]
+
+    made = iter([Toy(), Toy()])
+
+    def make() -> Toy:
+        try:
+            return next(made)
+        except StopIteration:
+            raise OSError("the simulator's licence is in use") from None
+
+    with pytest.raises(OSError, match="licence"):
+        run.train(TOY, seeds=[0], out=tmp_path / "a" / "b", make_env=make)
+    assert not (tmp_path / "a").exists()
+
+
+def test_an_environment_that_fails_for_good_keeps_the_checkpoint_to_go_on_from(tmp_path: Path) -> None:
+    taken, broken = [0], [True]
+
+    def fault() -> None:
+        taken[0] += 1
+        if broken[0] and taken[0] > 55:  # of which 20 are evaluations
+            raise RuntimeError("simulator gone")
+
+    with pytest.raises(UserError, match="failed 10 times in a row .* continue with mbdpg resume"):
+        run.train(TOY, seeds=[0], out=tmp_path, make_env=lambda: Toy(fault))
+    broken[0] = False
+    run.resume(tmp_path / "seed-0", make_env=lambda: Toy(fault))
+    assert (tmp_path / "seed-0" / "checkpoints" / "000000040").is_dir()
+
+
+def test_a_run_whose_first_evaluation_fails_still_keeps_its_best_policy(tmp_path: Path, capsys: Any) -> None:
+    taken = [0]
+
+    def fault() -> None:
+        taken[0] += 1
+        if taken[0] == 5:  # in the evaluation at step 0
+            raise RuntimeError("simulator gone")
+
+    (folder,) = run.train(TOY, seeds=[0], out=tmp_path, make_env=lambda: Toy(fault))
+    first = json.loads((folder / "metrics.jsonl").read_text().splitlines()[0])
+    assert (first["eval/return_mean"], first["eval/returns"], first["eval/faults"]) == (None, [], 1)
+    assert "evaluation episode dropped" in capsys.readouterr().err
+    assert run.load_policy(folder, best=True)(np.zeros(3, np.float32)).shape == (1,)
+
+
+@pytest.mark.parametrize("seeds", [[], [0, 0], [-1], [2**31]], ids=str)
+def test_seeds_that_are_none_are_refused(seeds: list[int], tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="seeds are"):
+        run.train(TOY, seeds=seeds, out=tmp_path / "run", make_env=Toy)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_policy_is_refused_where_it_does_not_fit(toy_run: Path, tmp_path: Path) -> None:
+    spec = dataclasses.replace(Toy.spec, id="Other-v0", observation_size=4)
+    with pytest.raises(UserError, match="is for 3 observation and 1 action entries, but Other-v0 has 4 and 1"):
+        run.load_policy(toy_run, spec=spec)
+    folder = edited(toy_run, tmp_path / "run")
+    (folder / "policy" / "latest.safetensors").write_bytes(b"no policy")
+    with pytest.raises(UserError, match="latest.safetensors is not a safetensors file"):
+        run.load_policy(folder)
+    shutil.rmtree(folder / "policy")
+    with pytest.raises(UserError, match="has no latest.safetensors yet"):
+        run.load_policy(folder)
