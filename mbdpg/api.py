@@ -49,7 +49,7 @@ def train(
     """
     agent = mbdpg.Config() if config is None else config
     settings = RunConfig(
-        env=env if isinstance(env, str) else _name(env),
+        env=env if isinstance(env, str) else _name(env) or "environment made in code",
         algorithm="td3" if isinstance(agent, td3.Config) else "mbdpg",
         agent=agent,
         schedule=schedule or Schedule(),
@@ -96,7 +96,7 @@ def load_policy(path: str | Path, *, best: bool = False) -> NumpyPolicy:
 
 
 def evaluate(env: Env, policy: Callable[[np.ndarray], np.ndarray], *, episodes: int = 10, seed: int = 0) -> Evaluation:
-    """Run episodes without exploration.
+    """Run episodes without exploration; they are others than those of the evaluations in training.
 
     Args:
         env: a Gymnasium id, or a function that makes an environment.
@@ -107,7 +107,7 @@ def evaluate(env: Env, policy: Callable[[np.ndarray], np.ndarray], *, episodes: 
     make = _maker(env)
     made = envs.make(str(env)) if make is None else make()
     try:
-        return run_episodes(made, policy, [envs.episode_seed(seed, "evaluate", i) for i in range(episodes)])
+        return run_episodes(made, policy, [envs.episode_seed(seed, "test", i) for i in range(episodes)])
     finally:
         made.close()
 
@@ -119,8 +119,10 @@ def _maker(env: Env | None) -> Callable[[], Environment] | None:
     return lambda: envs.wrap(env(), name=_name(env))
 
 
-def _name(env: envs.MakeGymnasium) -> str:
-    return str(getattr(env, "__name__", type(env).__name__))
+def _name(env: envs.MakeGymnasium) -> str | None:
+    """What to call an environment: its class's name or, for a function that has none of its own, nothing."""
+    name = getattr(env, "__name__", None)
+    return None if name == "<lambda>" else name
 
 
 def _only_evaluations(on_evaluation: Callable[[Update], None] | None) -> Callable[[Update], None]:

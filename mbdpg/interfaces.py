@@ -9,7 +9,16 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import (
+    Any,
+    Literal,
+    NamedTuple,
+    Protocol,
+    get_args,
+    get_origin,
+    get_type_hints,
+    runtime_checkable,
+)
 
 import numpy as np
 
@@ -28,12 +37,18 @@ def require(condition: bool, message: str) -> None:
 
 
 def require_settings(config: Any, *, positive: Sequence[str] = (), shares: Sequence[str] = ()) -> None:
-    """Check a config's numbers: those named positive, those named shares in [0, 1], all others at least 0."""
+    """Check a config's choices and numbers: `positive` ones, `shares` in [0, 1], and all others at least 0."""
+    kinds = get_type_hints(type(config))
     for field in dataclasses.fields(config):
-        value = getattr(config, field.name)
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            continue
+        value, kind = getattr(config, field.name), kinds[field.name]
         flag = "--" + field.name.replace("_", "-")
+        if get_origin(kind) is Literal:
+            choices = get_args(kind)
+            require(value in choices, f"{flag} is {value!r}, expected one of {', '.join(map(str, choices))}")
+            continue
+        wanted = (int, float) if kind is float else kind
+        fits = isinstance(value, wanted) and not isinstance(value, bool)
+        require(fits, f"{flag} is {value!r}, expected {kind.__name__}")
         if field.name in shares:
             require(0.0 <= value <= 1.0, f"{flag} is {value}, expected a number from 0 to 1")
         elif field.name in positive:
@@ -135,7 +150,7 @@ class Phase(NamedTuple):
     """One kind of gradient step of an agent, and how often and on what it is taken."""
 
     name: str
-    """`fitting` or `improving`; `time/<name>` counts its seconds."""
+    """As in `fitting` or `improving`; `time/<name>` counts its seconds."""
     updates_per_step: float
     """Gradient steps per environment step, once `after_steps` have passed."""
     after_steps: int
@@ -172,14 +187,13 @@ class Agent(Protocol):
     def exploration_std(self, state: Any) -> Any:
         """Standard deviation of the Gaussian behavior policy, in units of the action range's half."""
 
-    def diagnose(self, state: Any, batch: Batch, realized_return: Any, *, key: Any) -> Metrics:
+    def diagnose(self, state: Any, batch: Batch, realized_return: Any) -> Metrics:
         """Instruments on evaluation episodes that learning has never seen; sampled as `diagnosis` says.
 
         Args:
             state: the agent's.
             batch: windows of evaluation steps, shape (batch, time, ...).
             realized_return: discounted return that followed each window's first step, NaN where it is not known.
-            key: randomness.
         """
 
     @property

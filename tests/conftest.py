@@ -1,10 +1,12 @@
 """What every test runs under: CPU, one thread per native library, strict JAX, shapes and types checked at each call."""
 
+import importlib.util
 import os
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 
 # Before JAX and NumPy are imported. Inherited by the programs that tests start; set from outside, a value stays.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
@@ -97,3 +99,14 @@ def trained(mbdpg_command: Mbdpg, tmp_path_factory: pytest.TempPathFactory) -> P
 def flags() -> dict[str, tuple[str, ...]]:
     """The smallest run of each algorithm that has everything in it; --steps is missing."""
     return FLAGS
+
+
+@pytest.fixture(scope="session")
+def toy() -> ModuleType:
+    """The module toy.py beside this file."""
+    spec = importlib.util.spec_from_file_location("toy", Path(__file__).parent / "toy.py")
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["toy"] = module  # where dataclasses look for it
+    spec.loader.exec_module(module)
+    return module

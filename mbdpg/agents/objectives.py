@@ -96,7 +96,7 @@ def cloning_loss(actions: Float[Array, "batch action"], demonstrated: Float[Arra
 def value_bias(value: Float[Array, " batch"], realized_return: Float[Array, " batch"]) -> Metrics:
     """Means of a critic's value and of the discounted return that followed, where that is known (not NaN)."""
     known = jnp.isfinite(realized_return)
-    count = jnp.maximum(jnp.sum(known.astype(value.dtype)), 1.0)
+    count = jnp.sum(known.astype(value.dtype))  # 0 gives NaN: nothing is known
     realized = jnp.sum(jnp.where(known, realized_return, 0.0)) / count
     return {
         "critic/q_bias": jnp.sum(jnp.where(known, value, 0.0)) / count - realized,

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from mbdpg.agents import objectives
 from mbdpg.interfaces import Batch, EnvSpec, Metrics, Phase, Sampling, Statistics, require_settings
@@ -65,7 +65,7 @@ class State(eqx.Module):
     normalizer: Normalizer
     return_scale: Float[Array, ""]
     """Reward that counts as one unit of value."""
-    updates: Float[Array, ""]
+    updates: Int[Array, ""]
     """Critic updates so far."""
 
 
@@ -95,7 +95,7 @@ class TD3:
             critic_optimizer=self._optimizer.init(critics),
             normalizer=identity(o),
             return_scale=jnp.ones(()),
-            updates=jnp.zeros(()),
+            updates=jnp.zeros((), jnp.int32),
         )
 
     def prepare(self, state: State, statistics: Statistics) -> State:
@@ -109,7 +109,7 @@ class TD3:
 
     def exploration_std(self, state: State) -> Array:
         """Constant."""
-        return jnp.full_like(state.updates, self.config.exploration_std)
+        return jnp.full_like(state.return_scale, self.config.exploration_std)
 
     def update(self, state: State, batch: Batch, *, key: PRNGKeyArray) -> tuple[State, Metrics]:
         """One update from a batch of windows of one step."""
@@ -134,9 +134,9 @@ class TD3:
         state = eqx.tree_at(
             lambda x: (x.critics, x.critic_optimizer, x.updates),
             state,
-            (critics, critic_optimizer, state.updates + 1.0),
+            (critics, critic_optimizer, state.updates + 1),
         )
-        delayed = jnp.mod(state.updates, c.policy_delay) == 0.0
+        delayed = jnp.mod(state.updates, c.policy_delay) == 0
         state, objective = jax.lax.cond(
             delayed, lambda s: self._improve(s, observation), lambda s: (s, jnp.zeros(())), state
         )
@@ -172,9 +172,8 @@ class TD3:
         """One step is enough: there is no model to unroll."""
         return Sampling(256, burn_in=0, length=1)
 
-    def diagnose(self, state: State, batch: Batch, realized_return: Array, *, key: PRNGKeyArray) -> Metrics:
+    def diagnose(self, state: State, batch: Batch, realized_return: Array) -> Metrics:
         """Q against the return that followed."""
-        del key
         values = state.critics(state.normalizer(batch.observation[:, 0]), batch.action[:, 0])
         value = objectives.clipped_value(values) * state.return_scale
         return objectives.value_bias(value, realized_return)

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import re
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -135,10 +136,15 @@ def _train(args: list[str]) -> None:
         with RunDisplay(config.schedule.steps) as display:
             runs = train(config, seeds=flags.run.seeds, out=out, on_update=display, should_stop=stop)
         stop.exit_if_asked(f"mbdpg resume {out}")
-    picture = out / "learning-curve.png"
-    draw_curves({algorithm: runs}, picture, title=config.env)
-    print(f"done: {out}, learning curve in {picture}")
-    print(f"next: mbdpg evaluate {runs[0]} --episodes 10 --video {out / 'policy.mp4'}")
+    _finish(runs, algorithm, config.env)
+
+
+def _finish(runs: Sequence[Path], algorithm: str, env: str) -> None:
+    """Draw the learning curve beside the run folders and say what to do next."""
+    folder = runs[0].parent
+    draw_curves({algorithm: runs}, folder / "learning-curve.png", title=env)
+    print(f"done: {folder}, learning curve in {folder / 'learning-curve.png'}")
+    print(f"next: mbdpg evaluate {runs[0]} --episodes 10 --video {folder / 'policy.mp4'}")
 
 
 def _resume(args: list[str]) -> None:
@@ -155,7 +161,8 @@ def _resume(args: list[str]) -> None:
 
                 resume(run, steps=flags.steps, allow_import=flags.allow_import, watch=display, should_stop=stop)
             stop.exit_if_asked(f"mbdpg resume {flags.run}")
-            print(f"done: {run}")
+    config = RunFolder.open(runs[0]).config
+    _finish(runs, config["algorithm"], config["env"])
 
 
 def _evaluate(args: list[str]) -> None:
@@ -166,7 +173,7 @@ def _evaluate(args: list[str]) -> None:
     require(not folder.config.get("custom_env"), f"{flags.run} trained an environment made in code: use mbdpg.evaluate")
     # Nobody but the person at the keyboard may decide that code is imported.
     options = dataclasses.replace(config.env_options, allow_import=flags.allow_import)
-    seeds = [envs.episode_seed(flags.seed, "video", i) for i in range(flags.episodes)]
+    seeds = [envs.episode_seed(flags.seed, "test", i) for i in range(flags.episodes)]
     env = dataclasses.replace(config, env_options=options).make_env(render=flags.video is not None)
     policy = load_policy(flags.run, best=flags.best, spec=env.spec)
     returns, lengths = [], []
@@ -174,7 +181,7 @@ def _evaluate(args: list[str]) -> None:
         with contextlib.ExitStack() as stack:
             film = None
             if flags.video is not None and episode == 0:
-                film = stack.enter_context(VideoWriter(flags.video))
+                film = stack.enter_context(VideoWriter(flags.video, frames_per_second=env.frames_per_second))
             outcome = evaluate(env, policy, [seed], on_frame=film)
         returns += outcome.returns
         lengths += outcome.lengths

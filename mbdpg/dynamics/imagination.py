@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from mbdpg.dynamics.mixture import Memory, MixtureDynamics, Scales, next_observation
 
@@ -92,18 +92,20 @@ class ImaginationBuffer(NamedTuple):
     """Probability of being alive there."""
     depth: Float[Array, " slot"]
     """Imagined steps between the last real state and this one."""
-    added: Float[Array, ""]
+    added: Int[Array, ""]
     """States ever added."""
 
     @classmethod
     def empty(cls, slots: int, observation_size: int, memory: Memory) -> ImaginationBuffer:
         """No states; `memory` is one of shape (slots, memory)."""
-        return cls(jnp.zeros((slots, observation_size)), memory, jnp.zeros(slots), jnp.zeros(slots), jnp.zeros(()))
+        return cls(
+            jnp.zeros((slots, observation_size)), memory, jnp.zeros(slots), jnp.zeros(slots), jnp.zeros((), jnp.int32)
+        )
 
     def add(self, observation: Array, memory: Memory, weight: Array, depth: Array) -> ImaginationBuffer:
         """Overwrite the oldest states with a batch of new ones; the batch divides the number of slots."""
         slots, batch = self.weight.shape[0], weight.shape[0]
-        at = jnp.mod(self.added, slots).astype(jnp.int32)
+        at = jnp.mod(self.added, slots)
         new = ImaginationBuffer(observation, memory, weight, depth, self.added)
 
         def write(old: Array, fresh: Array) -> Array:

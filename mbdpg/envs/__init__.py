@@ -6,3 +6,4 @@ from mbdpg.envs.make import (
     make as make,
     wrap as wrap,
 )
+from mbdpg.envs.wrappers import GymnasiumEnvironment as GymnasiumEnvironment

@@ -47,7 +47,7 @@ ANT_CONTACT_FORCES = {27: False, 105: True}  # observation size of Ant-v5, to wh
 MakeGymnasium = Callable[[], gymnasium.Env[Any, Any]]
 """Makes an environment of a user's own."""
 
-ROLES = ("train", "evaluate", "expert", "video")
+ROLES = ("train", "evaluate", "expert", "test")
 
 # Known, harmless, and not the user's to mend. As an error, Box2D's would crash the interpreter on import.
 _GYMNASIUM_NOISE = (
@@ -128,7 +128,7 @@ def episode_seed(run_seed: int, role: str, episode: int) -> int:
 
     Args:
         run_seed: seed of the run, at least 0.
-        role: "train", "evaluate", "expert" or "video".
+        role: "train", "evaluate" (in training), "expert" or "test" (afterwards).
         episode: index of the episode within run and role, at least 0.
 
     Raises:

@@ -84,6 +84,11 @@ class GymnasiumEnvironment:
             raise UserError(f"{self.spec.id} rendered {found}, expected uint8 (height, width, 3): mend its render()")
         return np.ascontiguousarray(frame)
 
+    @property
+    def frames_per_second(self) -> float:
+        """Rendered steps per second of real time, as the environment says; 30 if it does not."""
+        return float(self._env.metadata.get("render_fps") or 30.0)
+
     def close(self) -> None:
         """Frees what the environment holds."""
         self._env.close()

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from mbdpg import envs
 from mbdpg.agents import mbdpg, td3
-from mbdpg.interfaces import Environment, require
+from mbdpg.interfaces import require
 from mbdpg.training.loop import Schedule
 
 Algorithm = Literal["mbdpg", "td3"]
@@ -25,6 +25,8 @@ class EnvOptions:
     """Steps after which an episode is truncated, instead of the environment's own limit."""
     observation_size: int | None = None
     """27 or 105, for Ant-v5: without or with contact forces."""
+    reference_return: float | None = None
+    """Return at which the task is solved, for exploration and beta to follow; by default what is known of it."""
     allow_import: bool = False
     """Allow an id of the form module:Id, which imports and so runs that module's code."""
 
@@ -42,9 +44,19 @@ class RunConfig:
     demonstrations: str | None = None
     """File of demonstrations to begin with."""
 
-    def make_env(self, *, render: bool = False) -> Environment:
+    def make_env(self, *, render: bool = False) -> envs.GymnasiumEnvironment:
         """The environment, from Gymnasium's registry."""
-        return envs.make(self.env, render=render, **dataclasses.asdict(self.env_options))
+        options = self.env_options
+        env = envs.make(
+            self.env,
+            render=render,
+            max_episode_steps=options.max_episode_steps,
+            observation_size=options.observation_size,
+            allow_import=options.allow_import,
+        )
+        if options.reference_return is not None:
+            env.spec = dataclasses.replace(env.spec, reference_return=options.reference_return)
+        return env
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> RunConfig:
@@ -79,6 +91,8 @@ def _settings(kind: type[Any], data: Any, name: str) -> Any:
         f"config.json does not fit this version of mbdpg: {name} differs in {sorted(data.keys() ^ known.keys())[:5]}",
     )
     for key, default in known.items():
-        kinds = (int, type(None)) if default is None else (int, float) if isinstance(default, float) else type(default)
-        require(isinstance(data[key], kinds), f"config.json has {name}.{key} = {str(data[key])[:40]!r}")
+        value, number = data[key], (int, float)
+        kinds = (*number, type(None)) if default is None else number if isinstance(default, float) else type(default)
+        fits = isinstance(value, kinds) and (isinstance(default, bool) or not isinstance(value, bool))
+        require(fits, f"config.json has {name}.{key} = {str(value)[:40]!r}")
     return kind(**data)

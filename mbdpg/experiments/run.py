@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import subprocess
+import sys
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -98,17 +100,27 @@ def resume(
     folder = RunFolder.open(path)
     config = RunConfig.from_json(folder.config)
     config = dataclasses.replace(config, env_options=dataclasses.replace(config.env_options, allow_import=allow_import))
-    if steps is not None:
-        require(steps >= config.schedule.steps, f"--steps is {steps}, less than the run's own {config.schedule.steps}")
-        config = dataclasses.replace(config, schedule=dataclasses.replace(config.schedule, steps=steps))
     if folder.config.get("custom_env") and make_env is None:
         raise UserError(f"{path} trained an environment made in code; resume it with mbdpg.resume(..., env=...)")
     make = make_env or config.make_env
     with contextlib.ExitStack() as stack:
         stack.enter_context(folder.locked())
+        _say_what_changed(path, folder.config.get("machine"))
         checkpoint = load_checkpoint(path)
-        recorder = _Recorder(folder, checkpoint)
-        training = _compose(config, _spec_of(make), make, [_seed_of(folder)], [recorder], stack, None, checkpoint)
+        try:
+            planned = max(int(checkpoint.facts["steps"]), config.schedule.steps)
+            require(
+                steps is None or steps >= checkpoint.env_steps,
+                f"--steps is {steps}, but {path} has {checkpoint.env_steps} behind it; expected at least as many",
+            )
+            schedule = dataclasses.replace(config.schedule, steps=planned if steps is None else steps)
+            config = dataclasses.replace(config, schedule=schedule)
+            recorders = [_Recorder(folder, checkpoint)]
+            training = _compose(config, _spec_of(make), make, [_seed_of(folder)], recorders, stack, None, checkpoint)
+        except (KeyError, IndexError, TypeError, ValueError) as error:
+            raise UserError(
+                f"the checkpoint of {path} at {checkpoint.env_steps} steps is not one that mbdpg wrote ({error!r})"
+            ) from error
         training.run(watch(config, training.env_steps), should_stop)
 
 
@@ -145,10 +157,16 @@ class _Recorder:
 
     def __init__(self, folder: RunFolder, checkpoint: Checkpoint | None = None):
         facts = checkpoint.facts["recorder"] if checkpoint else {"offsets": None, "best": None}
-        self._log = MetricsLog(folder.path, offsets=facts["offsets"])
+        self._folder = folder.path
+        self._offsets = facts["offsets"]
         self._checkpoints = CheckpointWriter(folder.path)
         self._policies = folder.path / "policy"
         self._best: float | None = facts["best"]
+
+    @cached_property
+    def _log(self) -> MetricsLog:
+        """Opened with the first row, because that cuts off all rows after the checkpoint: nothing may fail then."""
+        return MetricsLog(self._folder, offsets=self._offsets)
 
     def write(self, kind: str, env_steps: int, values: Metrics) -> None:
         self._log.write(kind, env_steps, values)
@@ -200,12 +218,10 @@ def _compose(
             replay.demonstrated = replay.size
         collectors.append(Collector(make, seed, replay, random_steps=config.agent.random_steps))
         stack.callback(collectors[-1].close)
-    evaluation_env = make()
-    stack.callback(evaluation_env.close)
     training = Training(
         Learner(agent, seeds),
         collectors,
-        evaluation_env,
+        make,
         recorders,
         config.schedule,
         expert_env_steps=demonstrations.expert_env_steps if demonstrations else 0,
@@ -215,10 +231,27 @@ def _compose(
     return training
 
 
+def _say_what_changed(path: Path, recorded: Any) -> None:
+    """A resume repeats bytes only on the same processor and versions: say what is another one now."""
+    before: dict[str, Any] = recorded if isinstance(recorded, dict) else {}
+    versions, now = before.get("versions"), describe_machine()
+    versions = versions if isinstance(versions, dict) else {}
+    changed = [name for name in ("cpu", "python", "XLA_FLAGS") if before.get(name) != now[name]]
+    changed += [name for name, version in now["versions"].items() if versions.get(name) != version]
+    if changed:
+        print(f"mbdpg: {path} was begun with another {', '.join(changed)}; its results may differ", file=sys.stderr)
+
+
 def _spec_of(make: MakeEnvironment) -> EnvSpec:
     env = make()
     env.close()
-    return env.spec
+    spec = env.spec
+    require(
+        spec.episode_limit is not None,
+        f"{spec.id} has no step limit, so an episode could go on for ever; set --max-episode-steps, or in code wrap it "
+        "in gymnasium.wrappers.TimeLimit",
+    )
+    return spec
 
 
 def _seed_of(folder: RunFolder) -> int:

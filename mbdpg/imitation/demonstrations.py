@@ -43,7 +43,9 @@ class Demonstrations:
         Raises:
             UserError: not a demonstration file, damaged, not finite, actions outside [-1, 1], or of other spaces.
         """
-        columns, facts = read_array_file(path, "demonstrations")
+        columns, facts = read_array_file(path.resolve(), "demonstrations")
+        env = str(facts.get("env"))[:80]
+        require(env == spec.id, f"{path} has demonstrations of {env}, expected {spec.id}")
         steps = facts.get("expert_env_steps")
         if not isinstance(steps, int) or steps < 0:
             raise UserError(f"{path} does not say how many steps its expert took; expected a number of at least 0")
@@ -58,7 +60,7 @@ class Demonstrations:
         require(replay.size > 0, f"{path} has no steps; expected at least one successful episode")
         require(bool((np.abs(columns["action"]) <= 1.0).all()), f"{path} has actions outside [-1, 1]")
         replay.close_episode()
-        return cls(replay, str(facts.get("env")), steps, facts)
+        return cls(replay, env, steps, facts)
 
 
 def record(
@@ -70,9 +72,9 @@ def record(
     expert_env_steps: int,
     seed: int,
 ) -> Demonstrations:
-    """Run the expert and keep its successful episodes: not terminated by failure, and a return of at least the rule's.
+    """Run the expert and keep the episodes whose return is at least the success rule's.
 
-    Tries four times as many episodes as asked for.
+    Tries up to four times as many episodes as asked for.
 
     Raises:
         UserError: none of them succeeded.

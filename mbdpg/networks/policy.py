@@ -30,7 +30,7 @@ class NumpyPolicy:
     """The same policy for one raw observation at a time, without JAX's dispatch: some tens of microseconds.
 
     Attributes:
-        arrays: the parameters by name, as in a run's `policy/policy.safetensors`.
+        arrays: the parameters by name, as in the files under a run's `policy/`.
     """
 
     def __init__(self, arrays: dict[str, np.ndarray]):
@@ -62,7 +62,10 @@ class NumpyPolicy:
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """The action, float32 in [-1, 1] of shape (action,), for a raw observation of shape (observation,)."""
-        x = np.clip((observation - self._mean) / self._std, -BOUND, BOUND)
+        x = np.asarray(observation, np.float32)
+        if x.shape != self._mean.shape:
+            raise ValueError(f"the policy takes observations of shape {self._mean.shape}, not {x.shape}")
+        x = np.clip((x - self._mean) / self._std, -BOUND, BOUND)
         for weight, bias, scale, offset in self._hidden:
             x = x @ weight + bias
             x -= x.mean()
@@ -73,7 +76,9 @@ class NumpyPolicy:
         return np.tanh(x @ weight + bias)
 
     def _check(self) -> None:
-        width = self._mean.shape[0] if self._mean.ndim == 1 else -1
+        if self._mean.ndim != 1 or self._std.shape != self._mean.shape:
+            raise ValueError(f"the policy's normalizer has shapes {self._mean.shape} and {self._std.shape}")
+        width = self._mean.shape[0]
         for weight, bias, scale, offset in self._hidden:
             if (
                 weight.ndim != 2
@@ -83,7 +88,7 @@ class NumpyPolicy:
                 raise ValueError(f"the policy's layers do not fit together at one of shape {weight.shape}")
             width = weight.shape[1]
         weight, bias = self._output
-        if self._std.shape != self._mean.shape or weight.shape[:1] != (width,) or bias.shape != weight.shape[1:]:
+        if weight.ndim != 2 or weight.shape[0] != width or bias.shape != weight.shape[1:]:
             raise ValueError(f"the policy's output {weight.shape} does not fit a layer of width {width}")
         for name, value in self.arrays.items():
             if not np.isfinite(value).all():

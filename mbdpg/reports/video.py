@@ -14,7 +14,7 @@ from mbdpg.interfaces import UserError
 class VideoWriter:
     """Writes frames to an MP4 file. Use it in a `with` block and call it with every frame."""
 
-    def __init__(self, path: Path, *, frames_per_second: int = 50):
+    def __init__(self, path: Path, *, frames_per_second: float):
         """Open `path` for writing.
 
         Raises:

@@ -5,13 +5,18 @@ from __future__ import annotations
 import contextlib
 import sys
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from mbdpg.envs import episode_seed
-from mbdpg.interfaces import Environment, NonFiniteError, UserError
+from mbdpg.interfaces import Environment, UserError
+from mbdpg.training.faults import EnvironmentFailedError, guarded
 from mbdpg.training.replay import Replay
+
+RECENT = 10
+"""Training episodes whose mean return counts as the policy's."""
 
 FAULTS_IN_A_ROW = 10
 """So many faults of the environment without one step between them end the run."""
@@ -54,20 +59,18 @@ class Collector:
                 if self._observation is None:
                     self._observation = self._reset()
                 self._step(self._action(policy, std))
-            except UserError:
-                raise
-            except NonFiniteError as error:
+            except EnvironmentFailedError as error:
                 self._recover(error)
-            except Exception as error:  # whatever an environment raises
-                self._recover(error)
-        if self.baseline is None and self.env_steps >= self._random_steps:
-            self.baseline = float(np.mean(self.returns)) if self.returns else self._return
+        if self.baseline is None and self.env_steps >= self._random_steps and self.returns:
+            self.baseline = float(np.mean(self.returns))
+        if self.baseline is not None:
+            del self.returns[:-RECENT]
 
     def progress(self, reference_return: float | None) -> float:
-        """How far the last ten training returns are on the way from a random policy's to the reference, in [0, 1]."""
+        """How far the last training returns are on the way from a random policy's to the reference, in [0, 1]."""
         if reference_return is None or self.baseline is None or not self.returns:
             return 0.0
-        recent = float(np.mean(self.returns[-10:]))
+        recent = float(np.mean(self.returns[-RECENT:]))
         span = max(reference_return - self.baseline, 1e-6)
         return float(np.clip((recent - self.baseline) / span, 0.0, 1.0))
 
@@ -112,11 +115,9 @@ class Collector:
             for action, expected in zip(actions, after, strict=True):
                 if not exact:
                     return False
-                observation = self._env.step(action).observation
+                observation = guarded(partial(self._env.step, action)).observation
                 exact = np.array_equal(observation, expected)
-        except UserError:
-            raise
-        except Exception:  # whatever an environment raises: it did not then
+        except EnvironmentFailedError:  # it did not then
             self._broken, exact = True, False
         self._observation = observation if exact else None
         return exact
@@ -136,7 +137,7 @@ class Collector:
 
     def _step(self, action: np.ndarray) -> None:
         assert self._observation is not None
-        step = self._env.step(action)
+        step = guarded(partial(self._env.step, action))
         self.replay.add(self._observation, action, step.reward, step.observation, step.terminated, step.truncated)
         self.env_steps += 1
         self._faults_in_a_row = 0
@@ -152,23 +153,22 @@ class Collector:
                 self._env.close()
             self._env = self._make_env()
             self._broken = False
-        return self._env.reset(seed=episode_seed(self.seed, "train", self.episode))
+        return guarded(partial(self._env.reset, seed=episode_seed(self.seed, "train", self.episode)))
 
     def _end_episode(self) -> None:
         self.episode += 1
         self._return = 0.0
         self._observation = None
 
-    def _recover(self, error: Exception) -> None:
+    def _recover(self, error: EnvironmentFailedError) -> None:
         self.faults += 1
         self._faults_in_a_row += 1
-        what = f"{type(error).__name__}: {error}".splitlines()[0]
         if self._faults_in_a_row >= FAULTS_IN_A_ROW:
             raise UserError(
-                f"{self._env.spec.id} failed {FAULTS_IN_A_ROW} times in a row ({what}); mend the environment, "
+                f"{self._env.spec.id} failed {FAULTS_IN_A_ROW} times in a row ({error}); mend the environment, "
                 "then continue with mbdpg resume"
             ) from error
-        print(f"mbdpg: episode {self.episode} dropped, the environment failed ({what})", file=sys.stderr)
+        print(f"mbdpg: episode {self.episode} dropped, the environment failed ({error})", file=sys.stderr)
         self.replay.close_episode()
         self._end_episode()
         self._broken = True

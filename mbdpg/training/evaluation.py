@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from mbdpg.interfaces import Batch, Environment, Sampling, UserError
+from mbdpg.interfaces import Batch, Environment, Sampling
+from mbdpg.training.faults import EnvironmentFailedError, guarded
 from mbdpg.training.replay import Replay
 
-TAIL = 300
-"""Steps before a time limit whose discounted return is not counted as known: the rest of it was never seen."""
+UNSEEN = 0.05
+"""A step's discounted return counts as known if at most this share of its weight lies beyond a time limit."""
 
 
 class Evaluation(NamedTuple):
@@ -27,10 +29,6 @@ class Evaluation(NamedTuple):
     """All their steps, and those before a fault."""
     faults: int = 0
     """Episodes dropped, because the environment raised or returned NaN."""
-
-
-class EnvironmentFailedError(Exception):
-    """Whatever an environment raised, told apart from what a policy or a video raises."""
 
 
 def evaluate(
@@ -75,40 +73,32 @@ def _episode(
     on_frame: Callable[[np.ndarray], None] | None,
 ) -> tuple[float, int]:
     """Append one episode to `steps`; return its return and length."""
-    observation, total, length, over = _guarded(partial(env.reset, seed=seed)), 0.0, 0, False
+    observation, total, length, over = guarded(partial(env.reset, seed=seed)), 0.0, 0, False
     while not over:
         if on_frame is not None:
             on_frame(env.render())
         action = np.asarray(policy(observation), np.float32)
-        step = _guarded(partial(env.step, action))
+        step = guarded(partial(env.step, action))
         steps.add(observation, action, step.reward, step.observation, step.terminated, step.truncated)
         observation, over = step.observation, step.terminated or step.truncated
         total, length = total + float(step.reward), length + 1
     return total, length
 
 
-def _guarded(call: Callable[[], Any]) -> Any:
-    try:
-        return call()
-    except UserError:
-        raise
-    except Exception as error:
-        raise EnvironmentFailedError(" ".join(f"{type(error).__name__}: {error}".split())) from error
-
-
 def realized_returns(steps: Replay, discount: float) -> np.ndarray:
     """Discounted return from every step of finished episodes to their end, float32.
 
-    NaN within `TAIL` steps of a truncation, where what would have followed is unknown.
+    NaN shortly before a truncation (299 steps at discount 0.99), where too much of what would follow was not seen.
     """
     columns = steps.columns()
     result = np.full(steps.size, np.nan, np.float32)
+    tail = math.ceil(math.log(UNSEEN) / math.log(discount)) if 0.0 < discount < 1.0 else 0
     value, known = 0.0, 0
     for row in range(steps.size - 1, -1, -1):
         if columns["terminated"][row]:
             value, known = 0.0, 0
         elif columns["truncated"][row]:
-            value, known = 0.0, -TAIL
+            value, known = 0.0, -tail
         value = float(columns["reward"][row]) + discount * value
         known += 1
         if known > 0:

@@ -24,7 +24,7 @@ class Learner:
         self.state = jax.jit(over_seeds(lambda key: agent.init(key=key)))(init_keys)
         self._prepare = jax.jit(over_seeds(agent.prepare))
         self._std = jax.jit(jax.vmap(agent.exploration_std))
-        self._diagnose = jax.jit(over_seeds(lambda s, b, r, k: agent.diagnose(s, b, r, key=k)))
+        self._diagnose = jax.jit(over_seeds(agent.diagnose))
         self._updates = {phase.name: _compile(phase) for phase in agent.phases}
 
     def prepare(self, statistics: Sequence[Statistics]) -> None:
@@ -41,10 +41,9 @@ class Learner:
         self.state, metrics = self._updates[phase.name](self.state, _stack(batches), keys, jnp.uint32(done))
         return {name: np.asarray(value) for name, value in metrics.items()}
 
-    def diagnose(self, batches: Sequence[Batch], realized: Sequence[np.ndarray], env_steps: int) -> Metrics:
+    def diagnose(self, batches: Sequence[Batch], realized: Sequence[np.ndarray]) -> Metrics:
         """The agent's instruments, one array of shape (seed,) per metric."""
-        keys = jax.vmap(jax.random.fold_in, (0, None))(self._keys, jnp.uint32(2**31 + env_steps))
-        metrics = self._diagnose(self.state, _stack(batches), np.stack(realized), keys)
+        metrics = self._diagnose(self.state, _stack(batches), np.stack(realized))
         return {name: np.asarray(value) for name, value in metrics.items()}
 
     def policies(self) -> list[dict[str, np.ndarray]]:

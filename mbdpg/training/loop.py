@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -73,7 +74,7 @@ class Training:
         self,
         learner: Learner,
         collectors: Sequence[Collector],
-        evaluation_env: Environment,
+        make_env: Callable[[], Environment],
         recorders: Sequence[Recorder],
         schedule: Schedule,
         *,
@@ -84,7 +85,7 @@ class Training:
         self.collectors = collectors
         self.schedule = schedule
         self.env_steps = 0
-        self._env = evaluation_env
+        self._make_env = make_env
         self._recorders = recorders
         self._expert_env_steps = expert_env_steps
         self._updates = {phase.name: 0 for phase in learner.agent.phases}
@@ -120,6 +121,7 @@ class Training:
                 "sums": self._sums[index],
             }
             facts |= {
+                "steps": self.schedule.steps,
                 "recorded": self._recorded,
                 "expert_env_steps": self._expert_env_steps,
                 "demonstrated": collector.replay.demonstrated,
@@ -130,7 +132,8 @@ class Training:
         """Go on where `save` was called; the collectors' replays are restored already."""
         self.env_steps = env_steps
         self.learner.restore(arrays)
-        self._updates = dict(facts[0]["updates"])
+        self._updates = {name: int(facts[0]["updates"][name]) for name in self._updates}
+        require(min(self._updates.values()) >= 0, "the checkpoint counts fewer than no updates")
         self._recorded = facts[0]["recorded"]
         self._expert_env_steps = facts[0]["expert_env_steps"]
         self._sums = [dict(fact["sums"]) for fact in facts]
@@ -201,7 +204,9 @@ class Training:
                 episode_seed(collector.seed, "evaluate", episode)
                 for episode in range(self.schedule.evaluation_episodes)
             ]
-            evaluations.append(evaluate(self._env, policy, seeds))
+            # A fresh environment: a resumed run has no used one, and a fault must not outlive its evaluation.
+            with contextlib.closing(self._make_env()) as env:
+                evaluations.append(evaluate(env, policy, seeds))
         metrics = self._diagnose(evaluations)
         self._seconds["evaluating"] += time.monotonic() - began
         for index, (recorder, evaluation) in enumerate(zip(self._recorders, evaluations, strict=True)):
@@ -227,7 +232,7 @@ class Training:
         for collector, evaluation in zip(self.collectors, evaluations, strict=True):
             rng = random_stream(collector.seed, "diagnose", self.env_steps)
             windows.append(diagnosis_windows(evaluation.steps, agent.diagnosis, agent.config.discount, rng))
-        return self.learner.diagnose([w[0] for w in windows], [w[1] for w in windows], self.env_steps)
+        return self.learner.diagnose([w[0] for w in windows], [w[1] for w in windows])
 
     def _log(self, stds: np.ndarray) -> None:
         for index, (collector, recorder) in enumerate(zip(self.collectors, self._recorders, strict=True)):

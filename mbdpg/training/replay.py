@@ -88,13 +88,14 @@ class Replay:
         Raises:
             UserError: the columns are not those of a replay.
         """
+        problem = _problem_with(columns)
+        if problem:
+            raise UserError(f"these are not the steps of a run or of demonstrations: {problem}")
+        replay = cls(columns["observation"].shape[1], columns["action"].shape[1])
         try:
-            replay = cls(columns["observation"].shape[1], columns["action"].shape[1])
             replay.extend(columns)
-        except (KeyError, ValueError, IndexError) as error:
-            raise UserError(
-                f"this is not a replay: {error}; expected the columns that a run or demonstration has"
-            ) from error
+        except ValueError as error:
+            raise UserError(f"these are not the steps of a run or of demonstrations: {error}") from error
         return replay
 
     def extend(self, columns: Mapping[str, np.ndarray]) -> None:
@@ -143,6 +144,27 @@ class Replay:
     def statistics(self, progress: float) -> Statistics:
         """Moments of all steps so far, as float32."""
         return self._moments.statistics(progress)
+
+
+def _problem_with(columns: Mapping[str, np.ndarray]) -> str | None:
+    """What keeps columns, perhaps a stranger's, from being a replay's; None if nothing does."""
+    wanted = {name: (column.dtype, column.ndim) for name, column in Replay(1, 1, capacity=1).columns().items()}
+    found = {name: (column.dtype, column.ndim) for name, column in columns.items()}
+    for name, kind in wanted.items():
+        if found.get(name) != kind:
+            return f"{name} is {found.get(name, 'missing')}, expected {kind[0]} of {kind[1]} axes"
+    rows = len(columns["reward"])
+    if any(len(columns[name]) != rows for name in wanted):
+        return "the columns have different lengths"
+    if columns["observation"].shape != columns["next_observation"].shape or columns["observation"].shape[1] > 10**6:
+        return f"observations of shape {columns['observation'].shape} and {columns['next_observation'].shape}"
+    # An episode starts at its own row or goes on from the one before, which must not have ended.
+    start, row = columns["start"], np.arange(rows)
+    before = np.concatenate([[-1], start[:-1]])
+    over = np.concatenate([[True], (columns["terminated"] | columns["truncated"])[:-1]])
+    if not np.where(over, start == row, (start == row) | (start == before)).all():
+        return "episodes do not begin where the ones before end"
+    return None
 
 
 class _Moments:

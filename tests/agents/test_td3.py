@@ -87,7 +87,8 @@ def test_the_actor_and_the_targets_move_at_every_second_update() -> None:
     before, after = states[1], states[2]
     for target, online in (("target_actor", "actor"), ("target_critics", "critics")):
         for old, new, followed in zip(
-            *map(jax.tree.leaves, (getattr(before, target), getattr(after, target), getattr(after, online))), strict=True
+            *map(jax.tree.leaves, (getattr(before, target), getattr(after, target), getattr(after, online))),
+            strict=True,
         ):
             np.testing.assert_allclose(new, 0.75 * old + 0.25 * followed, rtol=1e-5, atol=1e-6)
 

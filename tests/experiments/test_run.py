@@ -9,7 +9,7 @@ import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -183,6 +183,7 @@ class Toy:
     """Three observations, episodes of ten steps."""
 
     spec = EnvSpec("Toy-v0", observation_size=3, action_size=1, episode_limit=10, reference_return=None)
+    frames_per_second = 50.0
 
     def __init__(self, fault: Callable[[], None] = lambda: None) -> None:
         self._fault = fault
@@ -213,7 +214,13 @@ TOY = RunConfig(
 
 
 @pytest.fixture(scope="module")
-def toy_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def toys(toy: Any) -> Iterator[None]:
+    with toy.learned_by_toys():
+        yield
+
+
+@pytest.fixture(scope="module")
+def toy_run(toys: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run.train(TOY, seeds=[0], out=tmp_path_factory.mktemp("toy"), make_env=Toy)[0]
 
 
@@ -291,7 +298,7 @@ def test_a_run_folder_never_decides_that_code_is_imported(toy_run: Path, tmp_pat
         run.resume(folder)
 
 
-def test_a_run_that_could_not_begin_leaves_no_folder(tmp_path: Path) -> None:
+def test_a_run_that_could_not_begin_leaves_no_folder(toys: None, tmp_path: Path) -> None:
     (tmp_path / "new" / "seed-1").mkdir(parents=True)
     (tmp_path / "new" / "seed-1" / "mine.txt").write_text("mine")
     with pytest.raises(UserError, match="seed-1 is not empty"):
@@ -311,7 +318,7 @@ def test_a_run_that_could_not_begin_leaves_no_folder(tmp_path: Path) -> None:
     assert not (tmp_path / "a").exists()
 
 
-def test_an_environment_that_fails_for_good_keeps_the_checkpoint_to_go_on_from(tmp_path: Path) -> None:
+def test_an_environment_that_fails_for_good_keeps_the_checkpoint_to_go_on_from(toys: None, tmp_path: Path) -> None:
     taken, broken = [0], [True]
 
     def fault() -> None:
@@ -326,7 +333,9 @@ def test_an_environment_that_fails_for_good_keeps_the_checkpoint_to_go_on_from(t
     assert (tmp_path / "seed-0" / "checkpoints" / "000000040").is_dir()
 
 
-def test_a_run_whose_first_evaluation_fails_still_keeps_its_best_policy(tmp_path: Path, capsys: Any) -> None:
+def test_a_run_whose_first_evaluation_fails_still_keeps_its_best_policy(
+    toys: None, tmp_path: Path, capsys: Any
+) -> None:
     taken = [0]
 
     def fault() -> None:

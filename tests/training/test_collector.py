@@ -29,6 +29,7 @@ class Walk:
     """
 
     spec = SPEC
+    frames_per_second = 50.0
 
     def __init__(self, world: World) -> None:
         self._world = world
@@ -167,7 +168,7 @@ def test_each_episode_has_its_own_seed_from_that_of_the_run() -> None:
     made.collect(policy, 0.1, 100)
     assert world.seeds == [episode_seed(7, "train", episode) for episode in range(len(world.seeds))]
     assert len(world.seeds) > 10
-    assert made.episode == len(made.returns) and made.episode in (len(world.seeds) - 1, len(world.seeds))
+    assert made.episode in (len(world.seeds) - 1, len(world.seeds))
 
 
 def test_returns_are_the_sums_of_the_recorded_rewards() -> None:
@@ -176,7 +177,8 @@ def test_returns_are_the_sums_of_the_recorded_rewards() -> None:
     columns = made.replay.columns()
     ends = np.flatnonzero(columns["terminated"] | columns["truncated"]) + 1
     sums = [part.sum(dtype=np.float64) for part in np.split(columns["reward"], ends)[:-1]]
-    np.testing.assert_allclose(made.returns, sums, rtol=1e-5)
+    assert len(sums) > 10
+    np.testing.assert_allclose(made.returns, sums[-10:], rtol=1e-5)  # the last ten are all that is kept
 
 
 def test_progress_goes_from_random_returns_to_the_reference() -> None:

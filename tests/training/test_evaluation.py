@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mbdpg.interfaces import EnvSpec, NonFiniteError, Sampling, Step, UserError
-from mbdpg.training.evaluation import TAIL, diagnosis_windows, evaluate, realized_returns
+from mbdpg.training.evaluation import diagnosis_windows, evaluate, realized_returns
 from mbdpg.training.replay import Replay
 
 Ends = Callable[[int], tuple[bool, bool]]
@@ -18,6 +18,7 @@ class Count:
     """Observes the number of the step and the seed; pays the step's number plus the action."""
 
     spec = EnvSpec("Count-v0", observation_size=2, action_size=1, episode_limit=None, reference_return=None)
+    frames_per_second = 50.0
 
     def __init__(self, ends: Ends, faults: dict[int, tuple[int, Exception]] | None = None) -> None:
         self._ends = ends
@@ -127,12 +128,14 @@ def test_realized_returns_are_those_of_numpy() -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
-def test_realized_returns_near_a_time_limit_are_unknown() -> None:
-    length = TAIL + 10
+@pytest.mark.parametrize(("discount", "tail"), [(0.9, 29), (0.99, 299)])
+def test_realized_returns_near_a_time_limit_are_unknown(discount: float, tail: int) -> None:
+    length = tail + 10
     replay, reward = steps_of((length, "truncated"), (4, "terminated"), (6, "truncated"))
-    found = realized_returns(replay, 0.9)
-    np.testing.assert_array_equal(np.isnan(found), [False] * 10 + [True] * TAIL + [False] * 4 + [True] * 6)
-    np.testing.assert_allclose(found[:10], [np.polyval(reward[t:length][::-1], 0.9) for t in range(10)], rtol=1e-5)
+    found = realized_returns(replay, discount)
+    np.testing.assert_array_equal(np.isnan(found), [False] * 10 + [True] * tail + [False] * 4 + [True] * 6)
+    np.testing.assert_allclose(found[:10], [np.polyval(reward[t:length][::-1], discount) for t in range(10)], rtol=1e-5)
+    assert discount**tail < 0.05 < discount ** (tail - 1)
 
 
 def test_realized_returns_of_an_open_episode_do_not_leak_into_the_one_before() -> None:

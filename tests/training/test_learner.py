@@ -52,7 +52,7 @@ def learn(learner: Learner, seeds: list[int], rounds: range = range(2)) -> list[
 
 def diagnosed(learner: Learner, seeds: list[int]) -> dict[str, np.ndarray]:
     rows = [experience(seed).windows(np.arange(10), learner.agent.diagnosis) for seed in seeds]
-    return learner.diagnose(rows, [np.linspace(0, 1, 10, dtype=np.float32)] * len(seeds), 40)
+    return learner.diagnose(rows, [np.linspace(0, 1, 10, dtype=np.float32)] * len(seeds))
 
 
 def same(left: dict[str, np.ndarray], right: dict[str, np.ndarray]) -> bool:
@@ -74,7 +74,7 @@ class Two(NamedTuple):
 @pytest.fixture(scope="module", params=["toy", "td3", pytest.param("mbdpg", marks=pytest.mark.slow)])
 def two(request: pytest.FixtureRequest, toy: Any) -> Two:
     def make() -> Agent:
-        return {"toy": lambda: toy.agent(SPEC), "td3": make_td3, "mbdpg": make_mbdpg}[request.param]()
+        return {"toy": lambda: toy.ToyAgent(SPEC), "td3": make_td3, "mbdpg": make_mbdpg}[request.param]()
 
     together, alone = Learner(make(), [4, 9]), Learner(make(), [9])
     return Two(together, alone, learn(together, [4, 9]), learn(alone, [9]))
@@ -131,7 +131,7 @@ def test_a_snapshot_is_a_copy_that_later_updates_do_not_change(two: Two) -> None
     ids=["missing", "other shape", "other type"],
 )
 def test_a_snapshot_that_does_not_fit_is_refused_by_the_name_of_its_array(toy: Any, change: Any, said: str) -> None:
-    learner = Learner(toy.agent(SPEC), [4])
+    learner = Learner(toy.ToyAgent(SPEC), [4])
     before, name = learner.snapshot(0), "actor/mlp/output/weight"
     changed = {key: value for key, value in (before | {name: change(before[name])}).items() if value is not None}
     with pytest.raises(UserError) as caught:
@@ -173,7 +173,7 @@ def compilations() -> Iterator[list[str]]:
 
 
 def test_nothing_is_compiled_after_the_first_round(toy: Any, compilations: list[str]) -> None:
-    learner = Learner(toy.agent(SPEC), [4, 9])
+    learner = Learner(toy.ToyAgent(SPEC), [4, 9])
     learn(learner, [4, 9], range(1))
     diagnosed(learner, [4, 9])
     learner.actors()
@@ -189,7 +189,7 @@ def test_nothing_is_compiled_after_the_first_round(toy: Any, compilations: list[
 
 def test_metrics_are_means_over_the_steps_of_a_call(toy: Any) -> None:
     def losses(seed: int, counts: list[int]) -> list[float]:
-        learner, found = Learner(toy.agent(SPEC), [seed]), []
+        learner, found = Learner(toy.ToyAgent(SPEC), [seed]), []
         phase = learner.agent.phases[0]
         batch: Batch = experience(seed).sample(sum(counts), phase.sampling, np.random.default_rng(0))
         done = 0
@@ -204,7 +204,7 @@ def test_metrics_are_means_over_the_steps_of_a_call(toy: Any) -> None:
 
 
 def test_a_key_is_never_used_twice(toy: Any) -> None:
-    learner = Learner(toy.agent(SPEC), [4, 9])
+    learner = Learner(toy.ToyAgent(SPEC), [4, 9])
     drawn = []
     for phase in learner.agent.phases:
         for done in range(5):

@@ -43,7 +43,7 @@ def rows(recorder: Any, kind: str) -> dict[int, dict[str, Any]]:
 @pytest.fixture(scope="module")
 def whole(toy: Any) -> tuple[Any, list[Any], list[Update]]:
     """A run of two seeds that nobody disturbed."""
-    training, recorders = toy.training([0, 5])
+    training, recorders = toy.toy_training([0, 5])
     return training, recorders, run(training)
 
 
@@ -118,13 +118,13 @@ def test_evaluation_steps_never_reach_the_replay(whole: Any) -> None:
 @pytest.mark.parametrize("cuts", [[1], [30], [44], [70], [3, 3, 3], [41, 2, 9]], ids=str)
 def test_a_run_stopped_anywhere_and_resumed_equals_one_that_was_not(whole: Any, toy: Any, cuts: list[int]) -> None:
     _, (expected, _), _ = whole
-    training, (recorder,) = toy.training([0])
+    training, (recorder,) = toy.toy_training([0])
     for cut in [*cuts, 10**9]:
         asked = itertools.count(1)
         run(training, lambda asked=asked, cut=cut: next(asked) >= cut)
         env_steps, arrays, facts, columns = recorder.checkpoints[-1]
         kept = recorder.rows
-        training, (recorder,) = toy.training([0], replay=Replay.from_columns(columns))
+        training, (recorder,) = toy.toy_training([0], replay=Replay.from_columns(columns))
         recorder.rows = kept
         training.restore(env_steps, [arrays], [json.loads(json.dumps(facts))])
         recorder.checkpoints.append((env_steps, arrays, facts, columns))
@@ -140,7 +140,7 @@ def test_a_run_stopped_anywhere_and_resumed_equals_one_that_was_not(whole: Any, 
 
 
 def test_a_stop_between_two_updates_is_saved_there(toy: Any) -> None:
-    training, (recorder,) = toy.training([0])
+    training, (recorder,) = toy.toy_training([0])
     asked = itertools.count(1)
     updates = run(training, lambda: next(asked) >= 8)
     env_steps, _, facts, _ = recorder.checkpoints[-1]
@@ -152,7 +152,7 @@ def test_a_stop_between_two_updates_is_saved_there(toy: Any) -> None:
 def test_a_finished_run_that_is_resumed_adds_nothing(whole: Any, toy: Any) -> None:
     _, (expected, _), _ = whole
     env_steps, arrays, facts, columns = expected.checkpoints[-1]
-    training, (recorder,) = toy.training([0], replay=Replay.from_columns(columns))
+    training, (recorder,) = toy.toy_training([0], replay=Replay.from_columns(columns))
     training.restore(env_steps, [arrays], [json.loads(json.dumps(facts))])
     assert run(training) == []
     assert recorder.rows == []
@@ -161,14 +161,14 @@ def test_a_finished_run_that_is_resumed_adds_nothing(whole: Any, toy: Any) -> No
 
 def counted(toy: Any, *phases: Phase, random_steps: int = 0, demonstrated: int = 0) -> list[dict[str, int]]:
     """Updates taken by the end of each cycle of 5 steps."""
-    agent = toy.agent(toy.env.spec, toy.config(random_steps=random_steps))
+    agent = toy.ToyAgent(toy.ToyEnv.spec, toy.ToyConfig(random_steps=random_steps))
     agent.phases = tuple(phase._replace(update=agent.update) for phase in phases)
     replay = Replay(2, 1)
     for _ in range(demonstrated):
         replay.add(np.zeros(2, np.float32), np.zeros(1, np.float32), 0.0, np.ones(2, np.float32), False, True)
     replay.demonstrated = demonstrated
     schedule = Schedule(steps=20, cycle=5, evaluate_every=20, evaluation_episodes=1, log_every=5, checkpoint_every=5)
-    training, (recorder,) = toy.training([0], agent=agent, schedule=schedule, replay=replay)
+    training, (recorder,) = toy.toy_training([0], agent=agent, schedule=schedule, replay=replay)
     run(training)
     return [checkpoint[2]["counts"] for checkpoint in recorder.checkpoints]
 
@@ -176,12 +176,12 @@ def counted(toy: Any, *phases: Phase, random_steps: int = 0, demonstrated: int =
 @pytest.fixture
 def counts(monkeypatch: pytest.MonkeyPatch, toy: Any) -> Callable[..., list[dict[str, int]]]:
     """As `counted`, with the counters copied at each save, before they go on."""
-    save = toy.recorder.save_checkpoint
+    save = toy.ToyRecorder.save_checkpoint
 
     def copy(self: Any, env_steps: int, arrays: Any, facts: dict[str, Any], replay: Any) -> None:
         save(self, env_steps, arrays, facts | {"counts": dict(facts["updates"])}, replay)
 
-    monkeypatch.setattr(toy.recorder, "save_checkpoint", copy)
+    monkeypatch.setattr(toy.ToyRecorder, "save_checkpoint", copy)
     return lambda *phases, **settings: counted(toy, *phases, **settings)
 
 
@@ -227,7 +227,9 @@ class Failing:
 def test_an_environment_that_fails_in_evaluation_does_not_kill_training(
     toy: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    training, (recorder,) = toy.training([0], evaluation_env=toy.env(Failing(lambda episode: episode % 2 == 1)))
+    training, (recorder,) = toy.toy_training(
+        [0], make_env=lambda: toy.ToyEnv(Failing(lambda episode: episode % 2 == 1))
+    )
     run(training)
     assert training.env_steps == STEPS
     for row in rows(recorder, "eval").values():
@@ -246,7 +248,7 @@ def test_when_all_evaluation_episodes_fail_the_row_has_no_return(
         if now == step:
             raise FloatingPointError("nan")
 
-    training, (recorder,) = toy.training([0], evaluation_env=toy.env(fault))
+    training, (recorder,) = toy.toy_training([0], make_env=lambda: toy.ToyEnv(fault))
     updates = run(training)
     assert [update.evaluation[0].returns for update in updates if update.evaluation] == [[]] * 4
     for row in rows(recorder, "eval").values():
@@ -276,8 +278,10 @@ def test_a_schedule_that_cannot_be_kept_is_refused(settings: dict[str, int], sai
 def test_seconds_never_run_backwards_though_somebody_sets_the_clock(toy: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     wall, seconds = itertools.count(2_000_000_000, -3600), []
     monkeypatch.setattr(time, "time", lambda: float(next(wall)))
-    monkeypatch.setattr(toy.recorder, "write", lambda self, kind, steps, values: seconds.append(values["time/seconds"]))
-    training, _ = toy.training([0])
+    monkeypatch.setattr(
+        toy.ToyRecorder, "write", lambda self, kind, steps, values: seconds.append(values["time/seconds"])
+    )
+    training, _ = toy.toy_training([0])
     run(training)
     assert len(seconds) > 5 and seconds == sorted(seconds) and seconds[0] >= 0
 

@@ -226,7 +226,7 @@ def test_rewards_are_rebuilt_though_they_were_float64_when_they_came() -> None:
 )
 def test_columns_that_are_not_a_replay_are_refused_in_one_line(damage: dict[str, Any]) -> None:
     columns = {name: value for name, value in (filled().columns() | damage).items() if value is not None}
-    with pytest.raises(UserError, match="this is not a replay") as caught:
+    with pytest.raises(UserError, match="these are not the steps") as caught:
         Replay.from_columns(columns)
     assert "\n" not in str(caught.value)
 

@@ -115,9 +115,9 @@ class MBDPG:
         """One update of the critics (Eq. 16, 17) and of the actor (Eq. 18) on trajectories imagined after a batch."""
         c = self.config
         window = self._normalized(state, batch)
-        start_key, target_key = jax.random.split(key)
+        start_key, target_key, model_key = jax.random.split(key, 3)
         start = self._start(state, window, key=start_key)
-        gradient, (imagined, metrics) = jax.grad(self._actor_loss, has_aux=True)(state.actor, state, start)
+        gradient, (imagined, metrics) = jax.grad(self._actor_loss, has_aux=True)(state.actor, state, start, model_key)
         imagined = jax.lax.stop_gradient(imagined)
         targets = self._targets(state, window, start, imagined, key=target_key)
 
@@ -186,8 +186,8 @@ class MBDPG:
         c = self.config
         updates, memory = self._optimizers.critic.update(gradient, state.critic_optimizer)
         critics = optax.apply_updates(state.critics, updates)
-        count = state.critic_steps + 1.0
-        rate = jnp.where(jnp.mod(count, c.target_update_every) == 0.0, c.target_update_rate, 0.0)
+        count = state.critic_steps + 1
+        rate = jnp.where(jnp.mod(count, c.target_update_every) == 0, c.target_update_rate, 0.0)
         targets = optax.incremental_update((critics, state.actor), (state.target_critics, state.target_actor), rate)
         return eqx.tree_at(
             lambda x: (x.critics, x.critic_optimizer, x.target_critics, x.target_actor, x.critic_steps),
@@ -213,7 +213,9 @@ class MBDPG:
         use = (jnp.arange(batch) < round(self.config.imagination_ratio * batch)) & (model.weight > 0.0)
         return jax.tree.map(lambda m, r: jnp.where(use.reshape((-1,) + (1,) * (r.ndim - 1)), m, r), model, real)
 
-    def _actor_loss(self, actor: Policy, state: State, start: Start) -> tuple[Array, tuple[Trajectory, Metrics]]:
+    def _actor_loss(
+        self, actor: Policy, state: State, start: Start, key: PRNGKeyArray
+    ) -> tuple[Array, tuple[Trajectory, Metrics]]:
         """-J of Eq. 18 in units of the values' size; its derivative is Eq. 19 where `gradient` says so."""
         c = self.config
         printed = c.gradient == "eq19"
@@ -225,6 +227,7 @@ class MBDPG:
             start.memory,
             horizon=c.horizon,
             detach_policy_input=printed,
+            key=key if c.planning == "stochastic" else None,
         )
         seen = imagined.observations[c.first_value :]
         seen = jax.lax.stop_gradient(seen) if printed else seen
@@ -272,8 +275,7 @@ class MBDPG:
         """Windows long enough for the deepest open-loop error."""
         return Sampling(256, self.config.burn_in, max(instruments.DEPTHS))
 
-    def diagnose(self, state: State, batch: Batch, realized_return: Array, *, key: PRNGKeyArray) -> Metrics:
+    def diagnose(self, state: State, batch: Batch, realized_return: Array) -> Metrics:
         """Open-loop error, Q and survival against what happened, gradient norm per imagined depth."""
-        del key
         window = self._normalized(state, batch)
         return instruments.measure(self.config, state, window, realized_return)

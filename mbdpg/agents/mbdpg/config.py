@@ -18,6 +18,8 @@ class Config:
     """Imagined steps H that the critic is expanded over and the policy gradient flows through."""
     gradient: Literal["full", "eq19"] = "full"
     """Policy gradient: full differentiation of Eq. 18, or Eq. 19 as printed."""
+    planning: Literal["deterministic", "stochastic"] = "deterministic"
+    """Imagined states: the mixture's mean (Eq. 13), or a draw from it (Eq. 5, 12)."""
     discount: float = 0.99
     """Discount factor gamma per environment step."""
     batch_size: int = 64
@@ -65,7 +67,7 @@ class Config:
     fit_length: int = 10
     """Open-loop steps L that the dynamics are trained over."""
     burn_in: int = 5
-    """Real steps that fill the memory before an open-loop or imagined one."""
+    """Real steps that fill the memory before the one that open-loop training or imagination starts from."""
     fit_batch_size: int = 64
     """Windows per dynamics update."""
     fits_per_step: float = 0.2
@@ -73,7 +75,7 @@ class Config:
     pretraining_fits: int = 1000
     """Dynamics updates on the random steps before the first actor and critic update."""
     cloning_updates: int = 2000
-    """Updates of actor and critics on demonstrations, if there are any, before anything else (Section 4.2)."""
+    """Updates of actor and critics on demonstrations, if there are any, before other updates (Section 4.2)."""
     likelihood: Likelihood = "mixture"
     """Negative log-likelihood of the mixture itself, or Eq. 11 as printed."""
     mean_weight: float = 1.0

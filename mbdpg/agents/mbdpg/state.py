@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from mbdpg.agents.mbdpg.config import Config
 from mbdpg.dynamics.imagination import ImaginationBuffer
@@ -38,7 +38,7 @@ class State(eqx.Module):
     beta: Float[Array, ""]
     std: Float[Array, ""]
     """Of the behavior policy."""
-    critic_steps: Float[Array, ""]
+    critic_steps: Int[Array, ""]
     """Critic updates so far."""
 
 
@@ -88,5 +88,5 @@ def initial_state(config: Config, env: EnvSpec, optimizers: Optimizers, *, key: 
         imagined=ImaginationBuffer.empty(slots, o, dynamics.initial_memory((slots,))),
         beta=jnp.asarray(config.beta, jnp.float32),
         std=jnp.asarray(config.exploration_std, jnp.float32),
-        critic_steps=jnp.zeros(()),
+        critic_steps=jnp.zeros((), jnp.int32),
     )

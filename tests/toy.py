@@ -1,8 +1,12 @@
-"""An agent and an environment small enough to compile and run in a second, with everything that real ones have."""
+"""An agent and an environment small enough to compile and run in a second, with everything that real ones have.
+
+Tests get this module as the fixture `toy`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -11,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mbdpg.experiments import run
 from mbdpg.interfaces import Batch, EnvSpec, Metrics, Phase, Sampling, Statistics, Step
 from mbdpg.networks.normalizer import Normalizer, identity
 from mbdpg.networks.policy import Policy
@@ -24,6 +29,7 @@ from mbdpg.training.replay import Replay
 class ToyConfig:
     discount: float = 0.9
     random_steps: int = 20
+    width: int = 3
 
 
 class ToyState(NamedTuple):
@@ -47,7 +53,7 @@ class ToyAgent:
         )
 
     def init(self, *, key: Any) -> ToyState:
-        actor = Policy(self.env.observation_size, self.env.action_size, (3,), key=key)
+        actor = Policy(self.env.observation_size, self.env.action_size, (self.config.width,), key=key)
         return ToyState(actor, identity(self.env.observation_size), jnp.zeros(()), jnp.zeros((), jnp.int32))
 
     def prepare(self, state: ToyState, statistics: Statistics) -> ToyState:
@@ -69,14 +75,15 @@ class ToyAgent:
     def diagnosis(self) -> Sampling:
         return Sampling(4, 1, 1)
 
-    def diagnose(self, state: ToyState, batch: Batch, realized_return: Any, *, key: Any) -> Metrics:
-        return {"critic/q_bias": state.log + jnp.mean(batch.reward) + 0.0 * jax.random.normal(key, ())}
+    def diagnose(self, state: ToyState, batch: Batch, realized_return: Any) -> Metrics:
+        return {"critic/q_bias": state.log + jnp.mean(batch.reward)}
 
 
 class ToyEnv:
     """A point that actions move; episodes of 7 steps, every other terminated. `fault` sees (role, step of episode)."""
 
     spec = EnvSpec("Toy-v0", observation_size=2, action_size=1, episode_limit=7, reference_return=None)
+    frames_per_second = 50.0
 
     def __init__(self, fault: Callable[[int], None] = lambda step: None) -> None:
         self._fault = fault
@@ -123,27 +130,35 @@ class ToyRecorder:
         self.checkpoints.append((env_steps, arrays, facts, {name: column.copy() for name, column in replay.items()}))
 
 
-class Toy(NamedTuple):
-    """The classes above, and a function that puts a run of them together."""
-
-    agent: type[ToyAgent]
-    config: type[ToyConfig]
-    env: type[ToyEnv]
-    recorder: type[ToyRecorder]
-    training: Callable[..., tuple[Training, list[ToyRecorder]]]
+COMPILED: dict[Any, tuple[Learner, list[dict[str, np.ndarray]]]] = {}
 
 
-COMPILED: dict[tuple[int, ...], tuple[Learner, list[dict[str, np.ndarray]]]] = {}
-
-
-def toy_learner(seeds: Sequence[int]) -> Learner:
-    """A fresh learner of the standard agent; compiled once, so that there is one at a time."""
-    if tuple(seeds) not in COMPILED:
-        learner = Learner(ToyAgent(ToyEnv.spec), seeds)
-        COMPILED[tuple(seeds)] = learner, [learner.snapshot(index) for index in range(len(seeds))]
-    learner, fresh = COMPILED[tuple(seeds)]
+def toy_learner(seeds: Sequence[int], env: EnvSpec = ToyEnv.spec, config: ToyConfig | None = None) -> Learner:
+    """A fresh learner of the standard agent. Compiled once for each kind, so that there is one at a time of it."""
+    config = config or ToyConfig()
+    kind = tuple(seeds), env, config
+    if kind not in COMPILED:
+        learner = Learner(ToyAgent(env, config), seeds)
+        COMPILED[kind] = learner, [learner.snapshot(index) for index in range(len(seeds))]
+    learner, fresh = COMPILED[kind]
     learner.restore(fresh)
     return learner
+
+
+@contextlib.contextmanager
+def learned_by_toys() -> Iterator[None]:
+    """Whatever agent a run asks for, it gets the toy agent of that width, compiled once."""
+
+    def make_agent(config: Any, spec: EnvSpec) -> ToyAgent:
+        return ToyAgent(spec, ToyConfig(random_steps=config.agent.random_steps, width=config.agent.width))
+
+    def make_learner(agent: ToyAgent, seeds: Sequence[int]) -> Learner:
+        return toy_learner(seeds, agent.env, agent.config)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run, "make_agent", make_agent)
+        patch.setattr(run, "Learner", make_learner)
+        yield
 
 
 def toy_training(
@@ -151,7 +166,7 @@ def toy_training(
     *,
     agent: ToyAgent | None = None,
     schedule: Schedule | None = None,
-    evaluation_env: ToyEnv | None = None,
+    make_env: Callable[[], ToyEnv] = ToyEnv,
     replay: Replay | None = None,
 ) -> tuple[Training, list[ToyRecorder]]:
     learner = toy_learner(seeds) if agent is None else Learner(agent, seeds)
@@ -163,9 +178,4 @@ def toy_training(
         Collector(ToyEnv, seed, replay or Replay(2, 1), random_steps=learner.agent.config.random_steps)
         for seed in seeds
     ]
-    return Training(learner, collectors, evaluation_env or ToyEnv(), recorders, schedule), recorders
-
-
-@pytest.fixture(scope="session")
-def toy() -> Toy:
-    return Toy(ToyAgent, ToyConfig, ToyEnv, ToyRecorder, toy_training)
+    return Training(learner, collectors, make_env, recorders, schedule), recorders

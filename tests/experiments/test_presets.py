@@ -1,0 +1,85 @@
+"""The `paper` preset holds every number that Gao et al. 2022 state; the sections are given beside each."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import pytest
+
+from mbdpg.agents import mbdpg, td3
+from mbdpg.experiments.config import CONFIGS, RunConfig
+from mbdpg.experiments.presets import PAPER, agent_config, run_settings
+from mbdpg.interfaces import EnvSpec, UserError
+from mbdpg.training.loop import Schedule
+
+STATED = {
+    "width": 256,  # 5.1: three dense layers of size 256
+    "random_steps": 4000,  # 5.1: 4,000 time steps of random data
+    "batch_size": 128,  # 5.1: batches of 128
+    "fit_batch_size": 128,
+    "actor_learning_rate": 2e-4,  # 5.1: learning rate 2e-4 for dynamics, critic and actor
+    "critic_learning_rate": 2e-4,
+    "dynamics_learning_rate": 2e-4,
+    "discount": 0.99,  # 5.1
+    "gaussians": 5,  # 5.3.1: no gain beyond n = 5
+    "fit_length": 10,  # 5.3.1: L = 10
+    "horizon": 20,  # 5.3.2: H = 20
+    "target_update_every": 3,  # 5.3.2: C = 3
+    "target_update_rate": 1.0,  # targets are copies, "only updated after C iterations"
+    "gradient": "eq19",
+    "likelihood": "eq11",
+    "mean_weight": 0.0,  # Eq. 11 has no such term
+    "trace": 1.0,  # Eq. 16 has none but the last value
+    "first_value": 1,  # Eq. 18: the value terms begin at t = 1
+    "reward_weights": "uniform",  # Eq. 18: each reward has the weight beta
+}
+
+
+@pytest.mark.parametrize("name", STATED)
+def test_the_paper_preset_has_the_paper_s_number(name: str) -> None:
+    assert getattr(agent_config("mbdpg", "paper"), name) == STATED[name]
+
+
+def test_sequences_have_the_paper_s_length() -> None:
+    config = agent_config("mbdpg", "paper")
+    assert isinstance(config, mbdpg.Config)
+    assert config.burn_in + config.fit_length == 200  # 5.1: sequences of length 200
+
+
+def test_runs_and_episodes_have_the_paper_s_length() -> None:
+    schedule, options = run_settings("paper")
+    assert schedule.steps == 200_000  # Fig. 4, 5
+    assert options.max_episode_steps == 1000  # 5.1, in training and test
+
+
+def test_beta_falls_as_the_return_rises() -> None:
+    config = agent_config("mbdpg", "paper")
+    assert isinstance(config, mbdpg.Config)
+    assert config.beta > config.final_beta == 0  # 4.3.2: "avoid short-sightedness ... by updating beta"
+
+
+def test_networks_have_the_paper_s_three_layers() -> None:
+    agent = mbdpg.MBDPG(mbdpg.Config(width=4, memory=4), EnvSpec("Probe-v0", 2, 1, None, None))
+    state = jax.eval_shape(lambda: agent.init(key=jax.random.key(0)))
+    assert len(state.actor.mlp.hidden) == len(state.dynamics.trunk.hidden) == 3
+    assert jax.tree.structure(state.target_critics) == jax.tree.structure(state.critics)
+
+
+def test_the_default_preset_is_the_configs_own_defaults() -> None:
+    assert agent_config("mbdpg", "default") == mbdpg.Config()
+    assert agent_config("td3", "default") == agent_config("td3", "paper") == td3.Config()
+    schedule, options = run_settings("default")
+    assert schedule == Schedule() and options == RunConfig("Pendulum-v1").env_options
+
+
+@pytest.mark.parametrize("algorithm", CONFIGS)
+def test_a_preset_names_nothing_that_the_config_does_not_have(algorithm: str) -> None:
+    assert PAPER[algorithm].keys() <= {field.name for field in dataclasses.fields(CONFIGS[algorithm])}
+
+
+def test_unknown_names_are_refused_with_the_known_ones() -> None:
+    with pytest.raises(UserError, match="unknown --algorithm 'ppo'; expected one of mbdpg, td3"):
+        agent_config("ppo", "default")
+    with pytest.raises(UserError, match="unknown --preset 'big'; expected default or paper"):
+        agent_config("mbdpg", "big")
