@@ -44,6 +44,7 @@ def collect(name: str, runs: list[Path]) -> None:
             for row in zip(*(rows.get(column, absent) for column in COLUMNS), strict=True):
                 shown = [f"{value:.6g}" if isinstance(value, float) else value for value in row]
                 writer.writerow([config["env"], config["algorithm"], config["seed"], *shown])
+    config = RunFolder.open(runs[0]).config
     draw_curves({config["algorithm"]: runs}, here / f"{name}.png", title=config["env"])
 
 

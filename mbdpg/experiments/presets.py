@@ -1,4 +1,4 @@
-"""Values per preset, algorithm and environment; data only. docs/deviations.md has the evidence for the defaults."""
+"""Values per preset and algorithm; data only. docs/deviations.md has the differences, with their evidence."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ class Config:
     horizon: int = 5
     """Imagined steps H that the critic is expanded over and the policy gradient flows through."""
     gradient: Literal["full", "eq19"] = "full"
-    """Policy gradient: full differentiation of Eq. 18, or Eq. 19 as printed."""
+    """Policy gradient: Eq. 18 differentiated through imagined states and policy, or Eq. 19 as printed."""
     planning: Literal["deterministic", "stochastic"] = "deterministic"
     """Imagined states: the mixture's mean (Eq. 13), or a draw from it (Eq. 5, 12)."""
     discount: float = 0.99

@@ -1,0 +1,382 @@
+"""Each verb once, and what a person reads who got something wrong: one line, a status, and nothing left behind."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+import pytest
+
+import mbdpg
+from mbdpg.cli import main
+from mbdpg.cli.verbs import VERBS
+from mbdpg.experiments import expert
+from mbdpg.storage import RunFolder
+
+Start = Callable[..., "subprocess.Popen[str]"]
+TINY = (
+    *("--algorithm", "td3", "--width", "3", "--random-steps", "20", "--cycle", "10", "--steps", "40"),
+    *("--evaluate-every", "20", "--evaluation-episodes", "1", "--log-every", "20", "--checkpoint-every", "20"),
+    *("--max-episode-steps", "15"),
+)
+
+
+class Said(NamedTuple):
+    status: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def say(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., Said]:
+    """Runs the command line in this process, in an empty folder."""
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    monkeypatch.setenv("COLUMNS", "100")
+
+    def run(*arguments: str | Path) -> Said:
+        capsys.readouterr()
+        status: Any = 0
+        try:
+            main([str(argument) for argument in arguments])
+        except SystemExit as stop:
+            status = stop.code
+        captured = capsys.readouterr()
+        if isinstance(status, str):  # the interpreter prints it and exits with 1
+            return Said(1, captured.out, captured.err + status + "\n")
+        return Said(status or 0, captured.out, captured.err)
+
+    return run
+
+
+@pytest.fixture
+def toys(toy: Any) -> Iterator[None]:
+    with toy.learned_by_toys():
+        yield
+
+
+def check_refused(said: Said, *texts: str, status: int = 1) -> None:
+    assert said.status == status
+    assert said.err.count("\n") == 1 and said.err.startswith("mbdpg")
+    assert "Traceback" not in said.err and "unexpected" not in said.err
+    for text in texts:
+        assert text in said.err
+    assert len(said.err) < 700
+
+
+# Each verb once.
+
+
+def test_train_then_resume_then_evaluate(say: Any, toys: None, tmp_path: Path) -> None:
+    said = say("train", "Pendulum-v1", *TINY, "--seeds", "0", "4", "--out", tmp_path / "run")
+    assert said.status == 0, said.err
+    assert said.out == (
+        f"done: {tmp_path}/run, learning curve in {tmp_path}/run/learning-curve.png\n"
+        f"next: mbdpg evaluate {tmp_path}/run/seed-0 --episodes 10 --video {tmp_path}/run/policy.mp4\n"
+    )
+    assert [line.split()[1] for line in said.err.splitlines()] == ["0/40", "20/40", "40/40"]
+    names = sorted(path.name for path in (tmp_path / "run").iterdir())
+    assert names == ["learning-curve.png", "seed-0", "seed-4"]
+
+    said = say("resume", tmp_path / "run", "--steps", "60")  # a folder of runs
+    assert said.status == 0, said.err
+    assert said.out == f"done: {tmp_path}/run/seed-0\ndone: {tmp_path}/run/seed-4\n"
+    for seed in (0, 4):
+        assert (tmp_path / "run" / f"seed-{seed}" / "checkpoints" / "000000060").is_dir()
+
+    said = say("evaluate", tmp_path / "run" / "seed-4", "--episodes", "2", "--best")
+    assert said.status == 0 and said.err == ""
+    first, second, mean = said.out.splitlines()
+    assert first.startswith("episode 0: return -") and first.endswith(", 15 steps") and second.startswith("episode 1:")
+    assert mean.startswith("2 episodes: return -") and mean.endswith(" 15 steps")
+    again = say("evaluate", tmp_path / "run" / "seed-4", "--episodes", "2", "--best")
+    assert again.out == said.out
+    assert say("evaluate", tmp_path / "run" / "seed-4", "--episodes", "2", "--best", "--seed", "1").out != said.out
+
+
+def test_without_out_a_run_gets_a_folder_named_after_what_it_is(say: Any, toys: None) -> None:
+    said = say("train", "Pendulum-v1", *TINY)
+    assert said.status == 0, said.err
+    (folder,) = Path("runs").iterdir()
+    assert folder.name.startswith("Pendulum-v1-td3-") and (folder / "seed-0" / "metrics.jsonl").exists()
+
+
+def test_evaluate_writes_a_video_without_a_display(say: Any, trained: Path, tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    said = say("evaluate", trained, "--episodes", "1", "--video", tmp_path / "film.mp4")
+    assert said.status == 0, said.err
+    assert f"video of the first episode in {tmp_path}/film.mp4" in said.out
+    assert (tmp_path / "film.mp4").stat().st_size > 10_000
+
+
+def test_demonstrate_records_what_train_learns_from(say: Any, toys: None, tmp_path: Path, monkeypatch: Any) -> None:
+    config_of = expert.config_of
+
+    def short(env: str, steps: int, options: Any) -> Any:
+        return mbdpg.experiments.config.RunConfig(
+            env,
+            "td3",
+            mbdpg.TD3Config(width=3, random_steps=20),
+            mbdpg.Schedule(steps=steps, cycle=10, evaluate_every=20, evaluation_episodes=1, checkpoint_every=20, log_every=20),
+            config_of(env, 50, options).env_options,
+        )  # fmt: skip
+
+    monkeypatch.setattr(expert, "config_of", short)
+    file = tmp_path / "good.safetensors"
+    options = ("--episodes", "2", "--success-return", "-5000", "--max-episode-steps", "15")
+    said = say("demonstrate", "Pendulum-v1", "--out", file, "--steps", "40", *options)
+    assert said.status == 0, said.err
+    assert "2 of 2 episodes were successes" in said.out
+    assert f"demonstrations in {file}; they cost {40 + 2 * 15} environment steps" in said.out
+    run = tmp_path / "good-expert" / "seed-0"
+    again = say("demonstrate", "Pendulum-v1", "--out", tmp_path / "again.safetensors", "--expert", run, *options)
+    assert (tmp_path / "again.safetensors").read_bytes() == file.read_bytes(), again.err
+    said = say("train", "Pendulum-v1", *TINY, "--demonstrations", file, "--out", tmp_path / "run")
+    assert said.status == 0, said.err
+    first = json.loads((tmp_path / "run" / "seed-0" / "metrics.jsonl").read_text().splitlines()[0])
+    assert first["expert_env_steps"] == 70
+    assert sorted(path.name for path in Path.cwd().iterdir()) == []
+
+
+# Help.
+
+
+def test_the_overview_names_every_verb(say: Any) -> None:
+    for arguments in ((), ("-h",), ("--help",)):
+        said = say(*arguments)
+        assert said.status == 0 and said.err == ""
+        for verb in VERBS:
+            assert f"mbdpg {verb} " in said.out
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_each_verb_s_help_explains_every_flag(say: Any, verb: str) -> None:
+    said = say(verb, "--help")
+    assert said.status == 0 and said.err == ""
+    assert said.out.startswith(f"usage: mbdpg {verb}")
+    flags = [line for line in said.out.splitlines() if line.lstrip(" │").startswith("--")]
+    assert len(flags) >= 5
+    assert "--debug" in said.out and "traceback" in said.out
+    for word in ("_", "tuple[", "<class", "NoneType", "dataclass"):
+        assert word not in said.out.replace("mbdpg_", ""), word
+
+
+def test_train_s_help_shows_the_flags_of_the_algorithm_and_the_values_of_the_preset(say: Any) -> None:
+    standard, td3, paper = (
+        say("train", *flags, "--help").out
+        for flags in ((), ("--algorithm", "td3"), ("--preset=paper", "--algorithm", "mbdpg"))
+    )
+    assert "--horizon" in standard and "--horizon" not in td3
+    assert "--policy-delay" in td3 and "--policy-delay" not in standard
+    assert "(default: 20)" in paper and "(default: 200000)" in paper
+
+
+# What a person can get wrong.
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("train",), "env"),
+        (("train", "Pendulum-v1", "--wings", "2"), "--wings"),
+        (("train", "Pendulum-v1", "--steps", "many"), "--steps"),
+        (("train", "Pendulum-v1", "--gradient", "half"), "--gradient"),
+        (("resume",), "run"),
+        (("evaluate", "run", "--episodes", "1.5"), "--episodes"),
+        (("demonstrate", "Pendulum-v1"), "--out"),
+    ],
+    ids=str,
+)
+def test_wrong_usage_is_one_line_and_status_2(say: Any, arguments: tuple[str, ...], said: str) -> None:
+    check_refused(say(*arguments), f"mbdpg {arguments[0]}: ", said, status=2)
+    assert list(Path.cwd().iterdir()) == []
+
+
+def test_an_unknown_verb_is_answered_with_the_known_ones(say: Any) -> None:
+    check_refused(say("fly"), "there is no verb 'fly'; expected one of train, resume, evaluate, demonstrate")
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (("Pendulum-v9",), "Pendulum-v9 is not registered; nearest are"),
+        (("CartPole-v1",), "expected a bounded 1-D Box of floats"),
+        (("hostile:Env-v0",), "would run the code of the module hostile; if you trust it, pass --allow-import"),
+        (("Pendulum-v1", "--steps", "325"), "steps is 325, expected a multiple of cycle, 50"),
+        (("Pendulum-v1", "--steps", "0"), "steps is 0, expected at least 1"),
+        (("Pendulum-v1", "--width", "0"), "--width is 0"),
+        (("Pendulum-v1", "--discount", "1.5"), "--discount is 1.5, expected a number from 0 to 1"),
+        (("Pendulum-v1", "--actor-learning-rate", "nan"), "--actor-learning-rate is nan"),
+        (("Pendulum-v1", "--preset", "big"), "unknown --preset 'big'"),
+        (("Pendulum-v1", "--algorithm", "ppo"), "unknown --algorithm 'ppo'; expected one of mbdpg, td3"),
+        (("Pendulum-v1", "--seeds", "1", "1"), "seeds are [1, 1], expected different numbers"),
+        (("Pendulum-v1", "--seeds", "-1"), "seeds are [-1]"),
+        (("Pendulum-v1", "--max-episode-steps", "0"), "max_episode_steps is 0"),
+        (("Pendulum-v1", "--observation-size", "27"), "only Ant-v5 lets you choose"),
+        (("Pendulum-v1", "--demonstrations", "missing.safetensors"), "missing.safetensors is missing"),
+    ],
+    ids=str,
+)
+def test_what_cannot_be_trained_is_refused_and_leaves_no_run_folder(say: Any, flags: Any, said: str) -> None:
+    check_refused(say("train", *flags, "--out", "new/run"), said)
+    assert list(Path.cwd().iterdir()) == []
+
+
+def test_a_file_in_the_place_of_a_folder_is_named(say: Any) -> None:
+    Path("file").write_text("mine")
+    check_refused(say("train", "Pendulum-v1", "--out", "file/run"), "cannot create", "choose another --out")
+    check_refused(say("resume", "file"), "file is not a folder; expected one that `mbdpg train --out` made")
+    check_refused(say("evaluate", "file"), "file is not a folder")
+    said = say("train", "Pendulum-v1", "--demonstrations", "file", "--out", "run")
+    check_refused(said, "file is not a safetensors file", "expected an mbdpg demonstrations file")
+    assert [path.name for path in Path.cwd().iterdir()] == ["file"]
+    assert Path("file").read_text() == "mine"
+
+
+@pytest.mark.parametrize("verb", ["resume", "evaluate"])
+def test_a_missing_and_a_foreign_folder_are_named(say: Any, verb: str) -> None:
+    check_refused(say(verb, "missing"), "missing is not a folder")
+    Path("foreign").mkdir()
+    (Path("foreign") / "config.json").write_text('{"model": "gpt"}')
+    check_refused(say(verb, "foreign"), "foreign is not a run folder")
+    (Path("foreign") / "config.json").write_bytes(b"\x80\x04\x95")
+    check_refused(say(verb, "foreign"), "foreign is not a run folder", "not valid JSON")
+
+
+def test_a_run_that_never_saved_anything_is_said_so(say: Any, trained: Path) -> None:
+    shutil.copytree(trained, "run")
+    shutil.rmtree("run/checkpoints")
+    check_refused(say("resume", "run"), "no checkpoint to load", "none was saved yet")
+    shutil.rmtree("run/policy")
+    check_refused(say("evaluate", "run"), "has no latest.safetensors yet")
+
+
+def test_training_where_something_is_already_says_resume(say: Any, trained: Path) -> None:
+    shutil.copytree(trained, "run/seed-0")
+    before = sorted(path.name for path in Path("run").rglob("*"))
+    check_refused(say("train", "Pendulum-v1", "--out", "run"), "is not empty", "resume it or choose another --out")
+    check_refused(say("train", "Pendulum-v1", "--seeds", "7", "0", "--out", "run"), "is not empty")
+    assert sorted(path.name for path in Path("run").rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (("--episodes", "0"), "--episodes is 0, expected at least 1"),
+        (("--video", "film.gif"), "expected a name that ends in .mp4"),
+        (("--video", "file/film.mp4"), "cannot write file/film.mp4"),
+    ],
+    ids=str,
+)
+def test_an_evaluation_that_cannot_be_is_refused(say: Any, trained: Path, flags: Any, said: str) -> None:
+    Path("file").write_text("")
+    check_refused(say("evaluate", trained, *flags), said)
+    assert [path.name for path in Path.cwd().iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (("Humanoid-v5",), "nobody knows what a success in Humanoid-v5 is; say so with --success-return"),
+        (("Pendulum-v1", "--episodes", "0"), "--episodes is 0"),
+        (("Pendulum-v1", "--steps", "30"), "steps is 30"),
+        (("Pendulum-v1", "--expert", "missing"), "missing"),
+        (("Pendulum-v9",), "is not registered"),
+    ],
+    ids=str,
+)
+def test_demonstrations_that_cannot_be_are_refused_before_an_expert_is_trained(say: Any, flags: Any, said: str) -> None:
+    check_refused(say("demonstrate", *flags, "--out", "new/good.safetensors"), said)
+    assert list(Path.cwd().iterdir()) == []
+
+
+def test_an_expert_of_another_environment_is_refused(say: Any, trained: Path) -> None:
+    said = say("demonstrate", "LunarLanderContinuous-v3", "--out", "good.safetensors", "--expert", trained)
+    check_refused(said, "is for 3 observation and 1 action entries, but LunarLanderContinuous-v3 has 8 and 2")
+    assert list(Path.cwd().iterdir()) == []
+
+
+def test_an_expert_without_a_success_says_what_to_do(say: Any, trained: Path) -> None:
+    flags = ("--expert", trained, "--episodes", "1", "--success-return", "0")
+    check_refused(say("demonstrate", "Pendulum-v1", "--out", "good.safetensors", *flags), "--success-return")
+    assert list(Path.cwd().iterdir()) == []
+
+
+def test_every_verb_says_what_to_do_with_a_run_of_an_environment_made_in_code(say: Any, toys: None, toy: Any) -> None:
+    class Balance(gymnasium.Env[Any, Any]):
+        observation_space = gymnasium.spaces.Box(-1, 1, (2,))
+        action_space = gymnasium.spaces.Box(-1, 1, (1,))
+
+        def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, Any]:
+            return np.zeros(2, np.float32), {}
+
+        def step(self, action: np.ndarray) -> Any:
+            return np.zeros(2, np.float32), 0.0, False, True, {}
+
+    schedule = mbdpg.Schedule(steps=40, cycle=20, evaluate_every=40, log_every=40, checkpoint_every=40)
+    config = mbdpg.TD3Config(width=3, random_steps=20)
+    (folder,) = mbdpg.train(Balance, config=config, schedule=schedule, out="run")
+    check_refused(say("resume", folder), "environment made in code", "mbdpg.resume(..., env=...)")
+    check_refused(say("evaluate", folder), "environment made in code", "mbdpg.evaluate")
+    said = say("demonstrate", "Pendulum-v1", "--out", "good.safetensors", "--expert", folder)
+    check_refused(said, "is for 2 observation and 1 action entries, but Pendulum-v1 has 3 and 1")
+    assert RunFolder.open(folder).config["env"] == "Balance"
+
+
+def test_a_run_folder_never_decides_that_code_is_imported(say: Any, trained: Path, monkeypatch: Any) -> None:
+    Path("hostile.py").write_text("raise SystemExit('imported')")
+    monkeypatch.syspath_prepend(".")
+    shutil.copytree(trained, "run")
+    config = json.loads(Path("run/config.json").read_text())
+    config["run"] |= {"env": "hostile:Env-v0"}
+    config["run"]["env_options"]["allow_import"] = True
+    Path("run/config.json").write_text(json.dumps(config))
+    for verb in ("resume", "evaluate"):
+        check_refused(say(verb, "run"), "would run the code of the module hostile")
+    assert "hostile" not in sys.modules
+
+
+def test_the_last_of_two_algorithms_is_the_one_that_is_trained(say: Any, toys: None) -> None:
+    said = say("train", "Pendulum-v1", "--algorithm", "mbdpg", *TINY, "--out", "run")
+    assert said.status == 0, said.err
+    assert RunFolder.open(Path("run/seed-0")).config["algorithm"] == "td3"
+
+
+# Through the real program, once.
+
+
+def test_debug_shows_the_traceback_and_without_it_there_is_none(mbdpg_command: Start) -> None:
+    program = mbdpg_command("evaluate", "missing", "--debug")
+    _, stderr = program.communicate()
+    assert program.returncode == 1
+    assert "Traceback" in stderr and stderr.splitlines()[-1].startswith("mbdpg.interfaces.UserError: missing is not")
+    program = mbdpg_command("evaluate", "missing")
+    _, stderr = program.communicate()
+    assert program.returncode == 1
+    assert stderr == "mbdpg: missing is not a folder; expected one that `mbdpg train --out` made\n"
+
+
+def test_an_unexpected_error_is_one_line_too(say: Any, monkeypatch: Any) -> None:
+    def fail(arguments: list[str]) -> None:
+        raise RuntimeError("first\nsecond")
+
+    monkeypatch.setitem(VERBS, "train", fail)
+    said = say("train", "Pendulum-v1")
+    assert said == Said(1, "", "mbdpg: unexpected RuntimeError: first second; --debug shows where\n")
+    with pytest.raises(RuntimeError):
+        main(["train", "Pendulum-v1", "--debug"])
+
+
+def test_ctrl_c_where_there_is_nothing_to_save_is_no_traceback(say: Any, monkeypatch: Any) -> None:
+    def interrupted(arguments: list[str]) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(VERBS, "evaluate", interrupted)
+    assert say("evaluate", "run") == Said(130, "", "")
