@@ -66,16 +66,18 @@ def mbdpg_command(tmp_path_factory: pytest.TempPathFactory) -> Mbdpg:
     cache = tmp_path_factory.getbasetemp() / "compiled"
     environment = os.environ | {
         "PYTHONPATH": str(ROOT),
+        "XLA_FLAGS": "--xla_cpu_use_fusion_emitters=false",  # half the time to compile a large program
         "JAX_COMPILATION_CACHE_DIR": str(cache),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "0",
     }
 
-    def start(*arguments: str | Path) -> "subprocess.Popen[str]":
+    def start(*arguments: str | Path, **variables: str | None) -> "subprocess.Popen[str]":
+        changed = {name: value for name, value in (environment | variables).items() if value is not None}
         return subprocess.Popen(
             [sys.executable, "-m", "mbdpg", *map(str, arguments)],
             cwd=cache.parent,  # where nothing of the checkout is found by accident
-            env=environment,
+            env=changed,
             text=True,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

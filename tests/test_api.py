@@ -18,19 +18,19 @@ class Slider(gymnasium.Env[Any, Any]):
 
     observation_space = gymnasium.spaces.Box(-4, 4, (1,))
     action_space = gymnasium.spaces.Box(-2, 2, (1,))
-    made = 0
-
-    def __init__(self) -> None:
-        Slider.made += 1
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, Any]:
         super().reset(seed=seed)
-        self.place, self.taken = self.np_random.uniform(-2, 2, 1), 0
+        self.place = self.np_random.uniform(-2, 2, 1)
         return self.place, {}
 
     def step(self, action: np.ndarray) -> Any:
-        self.place, self.taken = np.clip(self.place + 0.1 * action, -4, 4), self.taken + 1
-        return self.place, -float(abs(self.place[0])), False, self.taken == 10, {}
+        self.place = np.clip(self.place + 0.1 * action, -4, 4)
+        return self.place, -float(abs(self.place[0])), False, False, {}
+
+
+def slider() -> gymnasium.Env[Any, Any]:
+    return gymnasium.wrappers.TimeLimit(Slider(), 10)
 
 
 SCHEDULE = mbdpg.Schedule(
@@ -47,7 +47,7 @@ def toys(toy: Any) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    (folder,) = mbdpg.train(Slider, config=CONFIG, schedule=SCHEDULE, out=tmp_path_factory.mktemp("api"))
+    (folder,) = mbdpg.train(slider, config=CONFIG, schedule=SCHEDULE, out=tmp_path_factory.mktemp("api"))
     return folder
 
 
@@ -55,7 +55,7 @@ def test_one_s_own_environment_and_config_are_trained_watched_and_used_in_a_few_
     seen: list[mbdpg.Update] = []
     config = mbdpg.MBDPGConfig(width=3, random_steps=20)
     (folder,) = mbdpg.train(
-        Slider, config=config, schedule=SCHEDULE, seeds=[7], out=tmp_path, on_evaluation=seen.append
+        slider, config=config, schedule=SCHEDULE, seeds=[7], out=tmp_path, on_evaluation=seen.append
     )
     assert folder == tmp_path / "seed-7"
     assert [update.env_steps for update in seen] == [0, 20, 40]
@@ -63,14 +63,14 @@ def test_one_s_own_environment_and_config_are_trained_watched_and_used_in_a_few_
     policy = mbdpg.load_policy(folder)
     action = policy(np.zeros(1, np.float32))
     assert action.shape == (1,) and np.abs(action).max() <= 1
-    found = mbdpg.evaluate(Slider, policy, episodes=3)
+    found = mbdpg.evaluate(slider, policy, episodes=3)
     assert len(found.returns) == 3 and found.lengths == [10, 10, 10] and found.faults == 0
 
 
 def test_several_seeds_have_a_folder_each_and_a_place_in_what_a_callback_sees(tmp_path: Path) -> None:
     seen: list[mbdpg.Update] = []
     folders = mbdpg.train(
-        Slider, config=CONFIG, schedule=SCHEDULE, seeds=[3, 5], out=tmp_path, on_evaluation=seen.append
+        slider, config=CONFIG, schedule=SCHEDULE, seeds=[3, 5], out=tmp_path, on_evaluation=seen.append
     )
     assert [path.name for path in folders] == ["seed-3", "seed-5"]
     for update in seen:
@@ -82,10 +82,10 @@ def test_a_run_with_one_s_own_environment_is_gone_on_with(folder: Path) -> None:
     seen: list[mbdpg.Update] = []
     with pytest.raises(mbdpg.UserError, match=r"made in code; resume it with mbdpg.resume\(..., env=...\)"):
         mbdpg.resume(folder)
-    mbdpg.resume(folder, env=Slider, steps=60, on_evaluation=seen.append)
+    mbdpg.resume(folder, env=slider, steps=60, on_evaluation=seen.append)
     assert [update.env_steps for update in seen] == [60]
-    with pytest.raises(mbdpg.UserError, match="--steps is 20, less than"):
-        mbdpg.resume(folder, env=Slider, steps=20)
+    with pytest.raises(mbdpg.UserError, match="--steps is 20, but .*seed-0 has 60 behind it"):
+        mbdpg.resume(folder, env=slider, steps=20)
 
 
 def test_the_best_policy_is_that_of_the_best_evaluation(tmp_path: Path) -> None:
@@ -95,7 +95,7 @@ def test_the_best_policy_is_that_of_the_best_evaluation(tmp_path: Path) -> None:
         assert update.evaluation is not None
         seen.append((float(np.mean(update.evaluation[0].returns)), update.env_steps))
 
-    (folder,) = mbdpg.train(Slider, config=CONFIG, schedule=SCHEDULE, out=tmp_path, on_evaluation=watch)
+    (folder,) = mbdpg.train(slider, config=CONFIG, schedule=SCHEDULE, out=tmp_path, on_evaluation=watch)
     best, latest = mbdpg.load_policy(folder, best=True), mbdpg.load_policy(folder)
     same = all(np.array_equal(best.arrays[name], latest.arrays[name]) for name in latest.arrays)
     assert same == (max(seen)[1] == 40)
@@ -103,15 +103,15 @@ def test_the_best_policy_is_that_of_the_best_evaluation(tmp_path: Path) -> None:
 
 def test_evaluation_is_repeatable_and_its_seed_decides(folder: Path) -> None:
     policy = mbdpg.load_policy(folder)
-    first, again, other = (mbdpg.evaluate(Slider, policy, episodes=3, seed=seed) for seed in (0, 0, 1))
+    first, again, other = (mbdpg.evaluate(slider, policy, episodes=3, seed=seed) for seed in (0, 0, 1))
     assert first.returns == again.returns != other.returns
 
 
 def test_a_policy_may_be_any_function_and_what_it_raises_comes_through() -> None:
-    found = mbdpg.evaluate(Slider, lambda observation: -np.sign(observation), episodes=2)
+    found = mbdpg.evaluate(slider, lambda observation: -np.sign(observation), episodes=2)
     np.testing.assert_array_equal(found.steps.columns()["action"], -np.sign(found.steps.columns()["observation"]))
     with pytest.raises(ZeroDivisionError):
-        mbdpg.evaluate(Slider, lambda observation: observation / (1 // 0))
+        mbdpg.evaluate(slider, lambda observation: observation / (1 // 0))
 
 
 def test_a_function_that_makes_the_environment_will_do(tmp_path: Path) -> None:
@@ -122,9 +122,8 @@ def test_a_function_that_makes_the_environment_will_do(tmp_path: Path) -> None:
 
 
 def test_a_registered_environment_is_named_by_its_id(tmp_path: Path) -> None:
-    short = mbdpg.Schedule(steps=20, cycle=20, evaluate_every=20, evaluation_episodes=1, log_every=20, checkpoint_every=20)  # fmt: skip
-    (folder,) = mbdpg.train("Pendulum-v1", config=CONFIG, schedule=short, out=str(tmp_path))
-    mbdpg.resume(str(folder), steps=40)
+    (folder,) = mbdpg.train("Pendulum-v1", config=CONFIG, schedule=SCHEDULE, out=str(tmp_path))
+    mbdpg.resume(str(folder), steps=60)
     found = mbdpg.evaluate("Pendulum-v1", mbdpg.load_policy(str(folder)), episodes=1)
     assert found.lengths == [200]
 
@@ -135,6 +134,8 @@ def test_what_an_environment_lacks_is_said_before_anything_is_written(tmp_path: 
 
     with pytest.raises(mbdpg.UserError, match="Discrete has the action space"):
         mbdpg.train(Discrete, config=CONFIG, schedule=SCHEDULE, out=tmp_path / "run")
+    with pytest.raises(mbdpg.UserError, match="Slider has no step limit.* gymnasium.wrappers.TimeLimit"):
+        mbdpg.train(Slider, config=CONFIG, schedule=SCHEDULE, out=tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
@@ -144,9 +145,9 @@ def test_a_callback_that_raises_ends_the_run_which_can_be_gone_on_with(tmp_path:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        mbdpg.train(Slider, config=CONFIG, schedule=SCHEDULE, out=tmp_path, on_evaluation=stop)
+        mbdpg.train(slider, config=CONFIG, schedule=SCHEDULE, out=tmp_path, on_evaluation=stop)
     seen: list[int] = []
-    mbdpg.resume(tmp_path / "seed-0", env=Slider, on_evaluation=lambda update: seen.append(update.env_steps))
+    mbdpg.resume(tmp_path / "seed-0", env=slider, on_evaluation=lambda update: seen.append(update.env_steps))
     assert seen == [40]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 import subprocess
@@ -87,7 +88,7 @@ def test_train_then_resume_then_evaluate(say: Any, toys: None, tmp_path: Path) -
 
     said = say("resume", tmp_path / "run", "--steps", "60")  # a folder of runs
     assert said.status == 0, said.err
-    assert said.out == f"done: {tmp_path}/run/seed-0\ndone: {tmp_path}/run/seed-4\n"
+    assert said.out.startswith(f"done: {tmp_path}/run, learning curve in {tmp_path}/run/learning-curve.png\n")
     for seed in (0, 4):
         assert (tmp_path / "run" / f"seed-{seed}" / "checkpoints" / "000000060").is_dir()
 
@@ -108,11 +109,12 @@ def test_without_out_a_run_gets_a_folder_named_after_what_it_is(say: Any, toys: 
     assert folder.name.startswith("Pendulum-v1-td3-") and (folder / "seed-0" / "metrics.jsonl").exists()
 
 
-def test_evaluate_writes_a_video_without_a_display(say: Any, trained: Path, tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.delenv("DISPLAY", raising=False)
-    said = say("evaluate", trained, "--episodes", "1", "--video", tmp_path / "film.mp4")
-    assert said.status == 0, said.err
-    assert f"video of the first episode in {tmp_path}/film.mp4" in said.out
+def test_evaluate_writes_a_video_without_a_display(mbdpg_command: Start, trained: Path, tmp_path: Path) -> None:
+    # Not in this process: ffmpeg is forked, which JAX, once it computes, warns about.
+    program = mbdpg_command("evaluate", trained, "--episodes", "1", "--video", tmp_path / "film.mp4", DISPLAY=None)
+    stdout, stderr = program.communicate()
+    assert (program.returncode, stderr) == (0, "")
+    assert f"video of the first episode in {tmp_path}/film.mp4" in stdout
     assert (tmp_path / "film.mp4").stat().st_size > 10_000
 
 
@@ -120,13 +122,11 @@ def test_demonstrate_records_what_train_learns_from(say: Any, toys: None, tmp_pa
     config_of = expert.config_of
 
     def short(env: str, steps: int, options: Any) -> Any:
-        return mbdpg.experiments.config.RunConfig(
-            env,
-            "td3",
-            mbdpg.TD3Config(width=3, random_steps=20),
-            mbdpg.Schedule(steps=steps, cycle=10, evaluate_every=20, evaluation_episodes=1, checkpoint_every=20, log_every=20),
-            config_of(env, 50, options).env_options,
-        )  # fmt: skip
+        agent = mbdpg.TD3Config(width=3, random_steps=20)
+        schedule = mbdpg.Schedule(
+            steps, cycle=10, evaluate_every=20, evaluation_episodes=1, checkpoint_every=20, log_every=20
+        )
+        return dataclasses.replace(config_of(env, 50, options), agent=agent, schedule=schedule)
 
     monkeypatch.setattr(expert, "config_of", short)
     file = tmp_path / "good.safetensors"
@@ -184,7 +184,7 @@ def test_train_s_help_shows_the_flags_of_the_algorithm_and_the_values_of_the_pre
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("train",), "env"),
+        (("train",), "Gymnasium id"),
         (("train", "Pendulum-v1", "--wings", "2"), "--wings"),
         (("train", "Pendulum-v1", "--steps", "many"), "--steps"),
         (("train", "Pendulum-v1", "--gradient", "half"), "--gradient"),
@@ -318,16 +318,19 @@ def test_every_verb_says_what_to_do_with_a_run_of_an_environment_made_in_code(sa
             return np.zeros(2, np.float32), {}
 
         def step(self, action: np.ndarray) -> Any:
-            return np.zeros(2, np.float32), 0.0, False, True, {}
+            return np.zeros(2, np.float32), 0.0, False, False, {}
+
+    def balance() -> gymnasium.Env[Any, Any]:
+        return gymnasium.wrappers.TimeLimit(Balance(), 5)
 
     schedule = mbdpg.Schedule(steps=40, cycle=20, evaluate_every=40, log_every=40, checkpoint_every=40)
     config = mbdpg.TD3Config(width=3, random_steps=20)
-    (folder,) = mbdpg.train(Balance, config=config, schedule=schedule, out="run")
+    (folder,) = mbdpg.train(balance, config=config, schedule=schedule, out="run")
     check_refused(say("resume", folder), "environment made in code", "mbdpg.resume(..., env=...)")
     check_refused(say("evaluate", folder), "environment made in code", "mbdpg.evaluate")
     said = say("demonstrate", "Pendulum-v1", "--out", "good.safetensors", "--expert", folder)
     check_refused(said, "is for 2 observation and 1 action entries, but Pendulum-v1 has 3 and 1")
-    assert RunFolder.open(folder).config["env"] == "Balance"
+    assert RunFolder.open(folder).config["env"] == "balance"
 
 
 def test_a_run_folder_never_decides_that_code_is_imported(say: Any, trained: Path, monkeypatch: Any) -> None:

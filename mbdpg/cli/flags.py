@@ -44,4 +44,4 @@ def one_line(text: str) -> str:
 def _plain(text: str) -> str:
     """Tyro's boxed explanation as one line."""
     without_colors = re.sub(r"\x1b\[[0-9;]*m", "", text)
-    return one_line(re.sub(r"[╭╮╰╯│─]+", " ", without_colors))
+    return one_line(re.sub(r"[╭╮╰╯│─]+|-{3,}", " ", without_colors))

@@ -115,7 +115,7 @@ class ImaginationBuffer(NamedTuple):
 
     def sample(self, batch: int, *, key: PRNGKeyArray) -> tuple[Array, Memory, Array, Array]:
         """Observations, memories, weights and depths of states drawn uniformly; weight 0 while there are none."""
-        filled = jnp.minimum(self.added, self.weight.shape[0])
+        filled = jnp.minimum(self.added, self.weight.shape[0]).astype(jnp.float32)
         rows = (jax.random.uniform(key, (batch,)) * filled).astype(jnp.int32)
         memory = Memory(self.memory.hidden[rows], self.memory.cell[rows])
         return self.observation[rows], memory, self.weight[rows], self.depth[rows]

@@ -185,7 +185,8 @@ class _Recorder:
         self._checkpoints.save(env_steps=env_steps, arrays=arrays, facts=facts, replay=replay)
 
     def close(self) -> None:
-        self._log.close()
+        if "_log" in vars(self):  # else closing would be what opens it
+            self._log.close()
 
 
 def make_agent(config: RunConfig, spec: EnvSpec) -> Agent:

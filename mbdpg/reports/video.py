@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,8 @@ class VideoWriter:
         """
         if path.suffix != ".mp4":
             raise UserError(f"the video is to be called {path.name!r}; expected a name that ends in .mp4")
+        # Otherwise ffmpeg is started by a fork, which may deadlock beside JAX's threads.
+        os.environ.setdefault("IMAGEIO_FFMPEG_NO_PREVENT_SIGINT", "1")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.open("ab").close()

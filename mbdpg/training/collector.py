@@ -151,7 +151,7 @@ class Collector:
         if self._broken:
             with contextlib.suppress(Exception):  # it is broken
                 self._env.close()
-            self._env = self._make_env()
+            self._env = guarded(self._make_env)
             self._broken = False
         return guarded(partial(self._env.reset, seed=episode_seed(self.seed, "train", self.episode)))
 

@@ -82,6 +82,9 @@ def in_numpy(dynamics: MixtureDynamics) -> tuple[np.ndarray, ...]:
     return d, rows[:, -3] * REWARD, rows[:, -2] * TERMINAL_REWARD
 
 
+KEY = jax.random.key(0)  # unused: planning is deterministic
+
+
 def start_states() -> Start:
     observation = jnp.asarray(np.random.default_rng(1).normal(size=(BATCH, O)), jnp.float32)
     still = jnp.zeros((BATCH, MEMORY))
@@ -92,7 +95,7 @@ def policy_gradient(state: State, start: Start, **settings) -> tuple[Policy, dic
     """The derivative of J, not of the loss -J, and what else the actor's loss returns."""
     settings = {"saturation_penalty": 0.0, "batch_size": BATCH, "discount": GAMMA} | settings
     agent = MBDPG(Config(**settings), ENV)
-    gradient, (_, metrics) = jax.jit(jax.grad(agent._actor_loss, has_aux=True))(state.actor, state, start)
+    gradient, (_, metrics) = jax.jit(jax.grad(agent._actor_loss, has_aux=True))(state.actor, state, start, KEY)
     return jax.tree.map(jnp.negative, gradient), metrics
 
 
@@ -174,13 +177,13 @@ def test_the_full_gradient_is_that_of_finite_differences(first_value: int, rewar
             lambda x: x.astype(jnp.float64) if x.dtype == jnp.float32 else x, (world(), start_states())
         )
         loss = jax.jit(agent._actor_loss)
-        gradient = jax.jit(jax.grad(agent._actor_loss, has_aux=True))(state.actor, state, start)[0]
-        assert abs(loss(state.actor, state, start)[1][1]["actor/objective"]) < 1
+        gradient = jax.jit(jax.grad(agent._actor_loss, has_aux=True))(state.actor, state, start, KEY)[0]
+        assert abs(loss(state.actor, state, start, KEY)[1][1]["actor/objective"]) < 1
         rng = np.random.default_rng(0)
         for _ in range(5):
             along = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), state.actor)
             ahead, behind = (
-                float(loss(jax.tree.map(lambda x, y, e=e: x + e * y, state.actor, along), state, start)[0])
+                float(loss(jax.tree.map(lambda x, y, e=e: x + e * y, state.actor, along), state, start, KEY)[0])
                 for e in (1e-5, -1e-5)
             )
             slope = sum(float(jnp.sum(g * y)) for g, y in zip(*map(jax.tree.leaves, (gradient, along)), strict=True))

@@ -313,7 +313,7 @@ def test_the_instruments_are_finite_and_named_as_documented() -> None:
     windows = batch(sampling.burn_in + sampling.length)
     windows = edited(windows, terminated=((0, 9), 1), valid=((0, slice(10, None)), 0))
     realized = np.float32([1.0, np.nan, 2.0, np.nan])
-    diagnose = jax.jit(lambda s, b, r: agent().diagnose(s, b, r, key=jax.random.key(0)))
+    diagnose = jax.jit(lambda s, b, r: agent().diagnose(s, b, r))
     metrics = diagnose(state(), windows, realized)
     depths = ("k01", "k05", "k10", "k20")
     names = {f"dynamics/{name}_{depth}" for name in ("rmse", "persistence") for depth in depths}

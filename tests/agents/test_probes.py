@@ -1,4 +1,4 @@
-"""Probe environments, each of which isolates one fault (after Andy Jones and rejax), as tables of transitions.
+"""Probe environments, each of which isolates one fault (after Andy Jones and rejax).
 
 What fails tells where to look: (1) the critics' loss or optimizer; (2) the observation's way into the critics;
 (3) discounting, targets, termination; (4) the actor's gradient; (5) the observation's way into the actor.
@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 
 from mbdpg.agents import mbdpg, td3
-from mbdpg.dynamics import mixture
 from mbdpg.interfaces import Agent, Batch, EnvSpec
 
-ROWS, BATCH, UPDATES, GAMMA = 512, 32, 500, 0.5
+ROWS, STEPS, BATCH, UPDATES, GAMMA = 512, 3, 32, 500, 0.5
 ENV = EnvSpec("probe", observation_size=1, action_size=1, episode_limit=None, reference_return=None)
 NETWORKS = {"width": 16, "target_noise": 0.0, "batch_size": BATCH, "discount": GAMMA, "target_update_rate": 0.1}
 AGENTS: dict[str, Agent] = {
@@ -25,11 +24,14 @@ AGENTS: dict[str, Agent] = {
         mbdpg.Config(
             **NETWORKS,
             **{f"{name}_learning_rate": 3e-3 for name in ("actor", "critic", "dynamics")},
-            **{"horizon": 2, "burn_in": 0, "fit_length": 1, "fit_batch_size": BATCH, "memory": 8, "gaussians": 2},
+            # Imagination sees memories of up to three steps, and so must fitting.
+            **{"horizon": 2, "burn_in": 0, "fit_length": 3, "fit_batch_size": BATCH, "memory": 8, "gaussians": 2},
         ),
         ENV,
     ),
 }
+Probe = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
+"""Reward, next observation and end, from observation and action."""
 
 
 class Learned(NamedTuple):
@@ -39,40 +41,42 @@ class Learned(NamedTuple):
     action: Callable[[float], float]
 
 
+def experience(probe: Probe, starts: list[float]) -> Batch:
+    """Episodes of up to three steps with random actions; no step is valid after the end."""
+    rng = np.random.default_rng(0)
+    observation, valid, steps = rng.choice(starts, ROWS), np.ones(ROWS), []
+    for _ in range(STEPS):
+        action = rng.uniform(-1, 1, ROWS)
+        reward, after, ends = (np.broadcast_to(x, ROWS) for x in probe(observation, action))
+        steps.append(Batch(observation[:, None], action[:, None], reward, after[:, None], ends, valid))
+        observation, valid = after, valid * (1 - ends)
+    return jax.tree.map(lambda *x: np.stack(x, axis=1).astype(np.float32), *steps)
+
+
 @pytest.fixture(scope="module", params=AGENTS)
-def learn(request: pytest.FixtureRequest) -> Callable[..., Learned]:
-    """Train an agent on a table of transitions; compiled once for all probes."""
+def learn(request: pytest.FixtureRequest) -> Callable[[Probe, list[float]], Learned]:
+    """Train an agent on a probe; compiled once for all of them."""
     agent = AGENTS[request.param]
-    names = [phase for phase in agent.phases if phase.name in ("fitting", "improving")]
+    phases = [phase for phase in agent.phases if phase.name in ("fitting", "improving")]
 
     @jax.jit
-    def train(table: Batch, key: jax.Array):
+    def train(windows: Batch, key: jax.Array):
         def step(state, key):
-            for i, phase in enumerate(names):
+            for i, phase in enumerate(phases):
                 rows = jax.random.randint(jax.random.fold_in(key, i), (BATCH,), 0, ROWS)
-                state, _ = phase.update(state, jax.tree.map(lambda x: x[rows, None], table), key=key)  # noqa: B023
+                length = phase.sampling.burn_in + phase.sampling.length
+                batch = jax.tree.map(lambda x, rows=rows, length=length: x[rows, :length], windows)
+                state, _ = phase.update(state, batch, key=key)
             return state, None
 
         init_key, loop_key = jax.random.split(key)
         return jax.lax.scan(step, agent.init(key=init_key), jax.random.split(loop_key, UPDATES))[0]
 
-    def trained(table: Batch):
-        # In a world without noise the likelihood's gradient grows to hundreds and drowns the reward head's.
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(mixture, "LOG_STD_MIN", -1.0)
-            return train(table, jax.random.key(7))
+    def one(x: float) -> jax.Array:
+        return jnp.full(1, x, jnp.float32)
 
-    def learned(observation, action, reward, next_observation, terminated) -> Learned:
-        columns = np.broadcast_arrays(*(np.asarray(x, np.float32) for x in (reward, terminated, np.ones(ROWS))))
-        reward, terminated, valid = columns
-        o, a, after = (
-            np.broadcast_to(x, (ROWS,)).astype(np.float32)[:, None] for x in (observation, action, next_observation)
-        )
-        state = trained(Batch(o, a, reward, after, terminated, valid))
-
-        def one(x: float) -> jax.Array:
-            return jnp.full(1, x, jnp.float32)
-
+    def learned(probe: Probe, starts: list[float]) -> Learned:
+        state = train(experience(probe, starts), jax.random.key(7))
         return Learned(
             value=lambda observation, action: float(jnp.min(state.critics(one(observation), one(action)))),
             action=lambda observation: float(state.actor(one(observation))[0]),
@@ -81,40 +85,37 @@ def learn(request: pytest.FixtureRequest) -> Callable[..., Learned]:
     return learned
 
 
-RNG = np.random.default_rng(0)
-ACTION = RNG.uniform(-1, 1, ROWS)
-SIGN = RNG.choice([-1.0, 1.0], ROWS)
 BEST, WORST = 1 / (1 - GAMMA), GAMMA / (1 - GAMMA) - 1
 """The value of a reward of 1 now, or of -1, and of 1 at every step from then on."""
 
 
 def test_1_a_constant_reward_is_the_value_of_a_single_step(learn: Callable[..., Learned]) -> None:
-    learned = learn(0, ACTION, 1, 0, 1)
+    learned = learn(lambda s, a: (1, s, 1), [0])
     assert learned.value(0, 0.3) == pytest.approx(1, abs=0.05)
 
 
 def test_2_the_value_depends_on_the_observation(learn: Callable[..., Learned]) -> None:
-    learned = learn(SIGN, ACTION, SIGN, SIGN, 1)
+    learned = learn(lambda s, a: (s, s, 1), [-1, 1])
     assert learned.value(1, 0.3) == pytest.approx(1, abs=0.1)
     assert learned.value(-1, 0.3) == pytest.approx(-1, abs=0.1)
 
 
 def test_3_a_reward_one_step_away_is_discounted_once(learn: Callable[..., Learned]) -> None:
-    second = SIGN > 0  # from -1 to 1 without a reward, and from there to the end with a reward of 1
-    learned = learn(SIGN, ACTION, second, 1, second)
+    # From -1 to 1 without a reward, and from there to the end with a reward of 1.
+    learned = learn(lambda s, a: (s > 0, np.ones(ROWS), s > 0), [-1, 1])
     assert learned.value(1, 0.3) == pytest.approx(1, abs=0.1)
     assert learned.value(-1, 0.3) == pytest.approx(GAMMA, abs=0.1)
 
 
 def test_4_the_actor_finds_the_action_that_pays(learn: Callable[..., Learned]) -> None:
-    learned = learn(0, ACTION, -ACTION, 0, 0)
+    learned = learn(lambda s, a: (-a, s, 0), [0])
     assert learned.action(0) < -0.9
     assert learned.value(0, -1) == pytest.approx(BEST, abs=0.25)
     assert learned.value(0, 1) == pytest.approx(WORST, abs=0.25)
 
 
 def test_5_the_actor_finds_the_action_that_pays_where_it_is(learn: Callable[..., Learned]) -> None:
-    learned = learn(SIGN, ACTION, SIGN * ACTION, -SIGN, 0)  # the observation changes its sign at every step
+    learned = learn(lambda s, a: (s * a, -s, 0), [-1, 1])  # the observation changes its sign at every step
     assert learned.action(1) > 0.9 and learned.action(-1) < -0.9
     for sign in (1, -1):
         assert learned.value(sign, sign) == pytest.approx(BEST, abs=0.25)

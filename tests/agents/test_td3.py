@@ -158,7 +158,7 @@ def test_the_instruments_compare_values_with_returns() -> None:
     assert one.diagnosis.burn_in == 0 and one.diagnosis.length == 1
     b = jax.tree.map(jnp.asarray, batch())
     realized = jnp.asarray([1.0, 2.0, *[jnp.nan] * (BATCH - 2)])
-    metrics = one.diagnose(state(), b, realized, key=jax.random.key(0))
+    metrics = one.diagnose(state(), b, realized)
     assert set(metrics) == {"critic/q_bias", "critic/realized_return"}
     values = state().critics(state().normalizer(b.observation[:2, 0]), b.action[:2, 0])
     assert float(metrics["critic/q_bias"]) == pytest.approx(2.0 * float(jnp.mean(jnp.min(values, 0))) - 1.5, rel=1e-4)

@@ -264,10 +264,9 @@ def test_an_environment_that_cannot_draw_says_so(registered: Any) -> None:
 
 
 NOISY = """
-import sys, mbdpg.envs
+import mbdpg.envs
 for name in ("HalfCheetah-v4", "Hopper-v5", "LunarLanderContinuous-v3", "BipedalWalker-v3"):
     env = mbdpg.envs.make(name); env.reset(seed=0)
-assert "jax" not in sys.modules
 """
 
 
@@ -314,7 +313,7 @@ def test_other_warnings_come_through(capfd: pytest.CaptureFixture[str]) -> None:
 
 
 def test_episode_seeds_are_31_bits_pure_and_never_shared_between_roles() -> None:
-    roles = ("train", "evaluate", "expert", "video")
+    roles = ("train", "evaluate", "expert", "test")
     seeds = {role: {mbdpg.envs.episode_seed(7, role, index) for index in range(2000)} for role in roles}
     assert [len(seeds[role]) for role in roles] == [2000] * 4
     assert len(set().union(*seeds.values())) == 8000
@@ -326,8 +325,8 @@ def test_episode_seeds_are_31_bits_pure_and_never_shared_between_roles() -> None
 
 
 def test_an_episode_seed_needs_a_known_role_and_no_negative_numbers() -> None:
-    with pytest.raises(ValueError, match="role is 'test', expected one of train, evaluate, expert, video"):
-        mbdpg.envs.episode_seed(0, "test", 0)
+    with pytest.raises(ValueError, match="role is 'video', expected one of train, evaluate, expert, test"):
+        mbdpg.envs.episode_seed(0, "video", 0)
     for run_seed, episode in ((-1, 0), (0, -1)):
         with pytest.raises(ValueError, match="non-negative"):
             mbdpg.envs.episode_seed(run_seed, "train", episode)
