@@ -105,8 +105,7 @@ def resume(
     make = make_env or config.make_env
     with contextlib.ExitStack() as stack:
         stack.enter_context(folder.locked())
-        _say_what_changed(path, folder.config.get("machine"))
-        checkpoint = load_checkpoint(path)
+        checkpoint, spec = load_checkpoint(path), _spec_of(make)
         try:
             planned = max(int(checkpoint.facts["steps"]), config.schedule.steps)
             require(
@@ -116,11 +115,12 @@ def resume(
             schedule = dataclasses.replace(config.schedule, steps=planned if steps is None else steps)
             config = dataclasses.replace(config, schedule=schedule)
             recorders = [_Recorder(folder, checkpoint)]
-            training = _compose(config, _spec_of(make), make, [_seed_of(folder)], recorders, stack, None, checkpoint)
+            training = _compose(config, spec, make, [_seed_of(folder)], recorders, stack, None, checkpoint)
         except (KeyError, IndexError, TypeError, ValueError) as error:
             raise UserError(
                 f"the checkpoint of {path} at {checkpoint.env_steps} steps is not one that mbdpg wrote ({error!r})"
             ) from error
+        _say_what_changed(path, folder.config.get("machine"))
         training.run(watch(config, training.env_steps), should_stop)
 
 

@@ -1,6 +1,7 @@
 """What each update of MBDPG moves, what it must not, and what it does with odd data."""
 
 import functools
+import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -169,7 +170,7 @@ def test_targets_wait_for_the_third_update_where_c_is_3() -> None:
     states = [state()]
     for i in range(6):
         states.append(step(states[-1], BATCHES["improve"], i)[0])
-    moved = [{"target_actor", "target_critics"} & differences(a, b) for a, b in zip(states, states[1:], strict=False)]
+    moved = [{"target_actor", "target_critics"} & differences(a, b) for a, b in itertools.pairwise(states)]
     both = {"target_actor", "target_critics"}
     assert moved == [set(), set(), both, set(), set(), both]
     for old, new, followed in zip(

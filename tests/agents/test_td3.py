@@ -1,6 +1,7 @@
 """One update of TD3: what it moves, and its targets against NumPy."""
 
 import functools
+import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -82,7 +83,7 @@ def test_the_actor_and_the_targets_move_at_every_second_update() -> None:
     states = [state()]
     for i in range(4):
         states.append(update(states[-1], batch(), seed=i)[0])
-    moved = [differences(a, b) for a, b in zip(states, states[1:], strict=False)]
+    moved = [differences(a, b) for a, b in itertools.pairwise(states)]
     assert moved == [CRITIC, ALL, CRITIC, ALL]
     before, after = states[1], states[2]
     for target, online in (("target_actor", "actor"), ("target_critics", "critics")):

@@ -38,7 +38,7 @@ def pair(rng: np.random.Generator, *lead: int) -> tuple[jax.Array, jax.Array]:
 
 def log_densities(p: Prediction, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """alpha_i and log p_i(target), without (O / 2) log 2 pi, by loops."""
-    log_p = np.zeros(target.shape[:-1] + (M,))
+    log_p = np.zeros((*target.shape[:-1], M))
     for at in np.ndindex(*target.shape[:-1]):
         for i in range(M):
             for o in range(O):
@@ -149,7 +149,7 @@ def test_every_output_belongs_to_one_head(dynamics: MixtureDynamics) -> None:
     jacobian = jax.jacobian(heads)(dynamics.trunk.output.bias)
     used = [np.abs(leaf).reshape(-1, leaf.shape[-1]).sum(axis=0) > 0 for leaf in jacobian]
     sizes = dict(zip(Prediction._fields, [mask.sum() for mask in used], strict=True))
-    assert sizes == dict(log_weights=M, means=M * O, log_stds=0, reward=1, terminal_reward=1, continue_logit=1)
+    assert sizes == {"log_weights": M, "means": M * O, "log_stds": 0, "reward": 1, "terminal_reward": 1, "continue_logit": 1}
     assert np.sum(used, axis=0).tolist() == [1] * (M * (O + 1) + 3)
 
 

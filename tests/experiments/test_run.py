@@ -378,3 +378,22 @@ def test_a_policy_is_refused_where_it_does_not_fit(toy_run: Path, tmp_path: Path
     shutil.rmtree(folder / "policy")
     with pytest.raises(UserError, match="has no latest.safetensors yet"):
         run.load_policy(folder)
+
+
+def test_a_resume_on_another_machine_says_what_changed(toy_run: Path, tmp_path: Path, capsys: Any) -> None:
+    machine = RunFolder.open(toy_run).config["machine"]
+    other = machine | {"cpu": "abacus", "versions": machine["versions"] | {"jax": "0.0.1"}}
+    run.resume(edited(toy_run, tmp_path / "other", machine=other), make_env=Toy)
+    assert "other was begun with another cpu, jax; its results may differ" in capsys.readouterr().err
+    run.resume(edited(toy_run, tmp_path / "same"), make_env=Toy)
+    assert capsys.readouterr().err == ""
+
+
+def test_what_an_environment_raises_when_it_is_made_is_not_blamed_on_the_checkpoint(
+    toy_run: Path, tmp_path: Path
+) -> None:
+    def make() -> Toy:
+        raise ValueError("no such track")
+
+    with pytest.raises(ValueError, match="no such track"):
+        run.resume(edited(toy_run, tmp_path / "run"), make_env=make)
