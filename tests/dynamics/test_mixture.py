@@ -149,7 +149,14 @@ def test_every_output_belongs_to_one_head(dynamics: MixtureDynamics) -> None:
     jacobian = jax.jacobian(heads)(dynamics.trunk.output.bias)
     used = [np.abs(leaf).reshape(-1, leaf.shape[-1]).sum(axis=0) > 0 for leaf in jacobian]
     sizes = dict(zip(Prediction._fields, [mask.sum() for mask in used], strict=True))
-    assert sizes == {"log_weights": M, "means": M * O, "log_stds": 0, "reward": 1, "terminal_reward": 1, "continue_logit": 1}
+    assert sizes == {
+        "log_weights": M,
+        "means": M * O,
+        "log_stds": 0,
+        "reward": 1,
+        "terminal_reward": 1,
+        "continue_logit": 1,
+    }
     assert np.sum(used, axis=0).tolist() == [1] * (M * (O + 1) + 3)
 
 

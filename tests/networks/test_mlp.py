@@ -58,9 +58,7 @@ def test_weights_start_with_the_spread_of_their_inputs_number(key: jax.Array) ->
 def test_no_two_layers_start_alike(key: jax.Array) -> None:
     mlp = MLP(4, (4, 4), 4, key=key)
     weights = [np.asarray(layer.weight) for layer in (*mlp.hidden, mlp.output)]
-    assert all(
-        np.abs(np.corrcoef(a.ravel(), b.ravel())[0, 1]) < 0.9 for a, b in itertools.pairwise(weights)
-    )
+    assert all(np.abs(np.corrcoef(a.ravel(), b.ravel())[0, 1]) < 0.9 for a, b in itertools.pairwise(weights))
 
 
 def test_output_scale_zero_starts_as_the_constant_zero(key: jax.Array) -> None:
