@@ -47,6 +47,9 @@ ANT_CONTACT_FORCES = {27: False, 105: True}  # observation size of Ant-v5, to wh
 MakeGymnasium = Callable[[], gymnasium.Env[Any, Any]]
 """Makes an environment of a user's own."""
 
+# The default camera stays where the robot began, and soon films an empty floor.
+TRACKED = {f"{name}-v5" for name in ("Ant", "HalfCheetah", "Hopper", "Humanoid", "Swimmer", "Walker2d")}
+
 ROLES = ("train", "evaluate", "expert", "test")
 
 # Known, harmless, and not the user's to mend. As an error, Box2D's would crash the interpreter on import.
@@ -84,6 +87,8 @@ def make(
     if render:
         prepare_headless_rendering()
         options["render_mode"] = "rgb_array"
+        if known_id in TRACKED:
+            options["camera_name"] = "track"
     env = _create(known_id, max_episode_steps, options)
     try:
         return wrap(env)

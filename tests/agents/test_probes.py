@@ -16,7 +16,7 @@ from mbdpg.agents import mbdpg, td3
 from mbdpg.dynamics import mixture
 from mbdpg.interfaces import Agent, Batch, EnvSpec
 
-ROWS, STEPS, BATCH, UPDATES, GAMMA = 512, 3, 32, 500, 0.5
+ROWS, STEPS, BATCH, UPDATES, GAMMA = 512, 3, 32, 800, 0.5
 ENV = EnvSpec("probe", observation_size=1, action_size=1, episode_limit=None, reference_return=None)
 NETWORKS = {"width": 16, "target_noise": 0.0, "batch_size": BATCH, "discount": GAMMA, "target_update_rate": 0.1}
 AGENTS: dict[str, Agent] = {

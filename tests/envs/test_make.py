@@ -15,7 +15,7 @@ import pytest
 from gymnasium.spaces import Box, Dict, Discrete
 
 import mbdpg.envs
-from mbdpg.envs.make import OLD_IDS, _layers, _quiet_construction, _say_once
+from mbdpg.envs.make import OLD_IDS, TRACKED, _layers, _quiet_construction, _say_once
 from mbdpg.interfaces import EnvSpec, UserError
 
 REPOSITORY = Path(mbdpg.envs.__file__).parents[2]
@@ -330,3 +330,10 @@ def test_an_episode_seed_needs_a_known_role_and_no_negative_numbers() -> None:
     for run_seed, episode in ((-1, 0), (0, -1)):
         with pytest.raises(ValueError, match="non-negative"):
             mbdpg.envs.episode_seed(run_seed, "train", episode)
+
+
+@pytest.mark.parametrize("env_id", sorted(TRACKED))
+def test_the_camera_follows_the_robot(env_id: str) -> None:
+    env = mbdpg.envs.make(env_id, render=True)
+    assert env._env.unwrapped.mujoco_renderer.camera_id == env._env.unwrapped.model.camera("track").id
+    env.close()
