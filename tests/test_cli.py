@@ -355,15 +355,13 @@ def test_the_last_of_two_algorithms_is_the_one_that_is_trained(say: Any, toys: N
 # Through the real program, once.
 
 
-def test_debug_shows_the_traceback_and_without_it_there_is_none(mbdpg_command: Start) -> None:
+def test_debug_shows_the_traceback_and_without_it_there_is_none(mbdpg_command: Start, say: Any) -> None:
     program = mbdpg_command("evaluate", "missing", "--debug")
     _, stderr = program.communicate()
     assert program.returncode == 1
     assert "Traceback" in stderr and stderr.splitlines()[-1].startswith("mbdpg.interfaces.UserError: missing is not")
-    program = mbdpg_command("evaluate", "missing")
-    _, stderr = program.communicate()
-    assert program.returncode == 1
-    assert stderr == "mbdpg: missing is not a folder; expected one that `mbdpg train --out` made\n"
+    said = "mbdpg: missing is not a folder; expected one that `mbdpg train --out` made\n"
+    assert say("evaluate", "missing") == Said(1, "", said)
 
 
 def test_an_unexpected_error_is_one_line_too(say: Any, monkeypatch: Any) -> None:

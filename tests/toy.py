@@ -29,6 +29,7 @@ from mbdpg.training.replay import Replay
 class ToyConfig:
     discount: float = 0.9
     random_steps: int = 20
+    exploration_color: float = 0.0
     width: int = 3
 
 
@@ -175,7 +176,7 @@ def toy_training(
     )
     recorders = [ToyRecorder() for _ in seeds]
     collectors = [
-        Collector(ToyEnv, seed, replay or Replay(2, 1), random_steps=learner.agent.config.random_steps)
+        Collector(ToyEnv, seed, replay or Replay(2, 1), random_steps=learner.agent.config.random_steps, color=0.0)
         for seed in seeds
     ]
     return Training(learner, collectors, make_env, recorders, schedule), recorders

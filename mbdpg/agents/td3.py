@@ -40,6 +40,8 @@ class Config:
     """Bound of that noise."""
     exploration_std: float = 0.1
     """Standard deviation of the Gaussian behavior policy."""
+    exploration_color: float = 0.0
+    """Noise of the behavior policy has power 1/f^color: 0 is white, 1 pink, correlated over many steps."""
     random_steps: int = 4000
     """Environment steps with uniformly random actions before learning starts."""
     width: int = 256

@@ -217,7 +217,8 @@ def _compose(
         elif demonstrations:
             replay.extend(demonstrations.replay.columns())
             replay.demonstrated = replay.size
-        collectors.append(Collector(make, seed, replay, random_steps=config.agent.random_steps))
+        random_steps, color = config.agent.random_steps, config.agent.exploration_color
+        collectors.append(Collector(make, seed, replay, random_steps=random_steps, color=color))
         stack.callback(collectors[-1].close)
     training = Training(
         Learner(agent, seeds),

@@ -13,6 +13,7 @@ import numpy as np
 from mbdpg.envs import episode_seed
 from mbdpg.interfaces import Environment, UserError
 from mbdpg.training.faults import EnvironmentFailedError, guarded
+from mbdpg.training.randomness import NOISE_BLOCK, noise_block, random_stream
 from mbdpg.training.replay import Replay
 
 RECENT = 10
@@ -22,11 +23,6 @@ FAULTS_IN_A_ROW = 10
 """So many faults of the environment without one step between them end the run."""
 
 
-def random_stream(seed: int, role: str, counter: int) -> np.random.Generator:
-    """Randomness as a pure function of what it is for, so that no generator's state is ever stored."""
-    return np.random.default_rng([seed, *role.encode(), counter])
-
-
 class Collector:
     """One environment and everything that stepping it changes.
 
@@ -34,7 +30,9 @@ class Collector:
     recorded of the episode is closed as truncated, the environment is made anew and the fault is counted.
     """
 
-    def __init__(self, make_env: Callable[[], Environment], seed: int, replay: Replay, *, random_steps: int):
+    def __init__(
+        self, make_env: Callable[[], Environment], seed: int, replay: Replay, *, random_steps: int, color: float
+    ):
         """Start the first episode; the replay may hold demonstrations already."""
         self.seed = seed
         self.replay = replay
@@ -44,6 +42,7 @@ class Collector:
         self.returns: list[float] = []
         self.baseline: float | None = None
         self._random_steps = random_steps
+        self._color = color
         self._make_env = make_env
         self._env = make_env()
         self._broken = False
@@ -128,11 +127,11 @@ class Collector:
 
     def _action(self, policy: Callable[[np.ndarray], np.ndarray], std: float) -> np.ndarray:
         size = self._env.spec.action_size
-        noise = random_stream(self.seed, "act", self.env_steps)
         if self.env_steps < self._random_steps:
-            return noise.uniform(-1.0, 1.0, size).astype(np.float32)
+            return random_stream(self.seed, "act", self.env_steps).uniform(-1.0, 1.0, size).astype(np.float32)
         assert self._observation is not None
-        action = policy(self._observation) + std * noise.standard_normal(size)
+        block, row = divmod(self.env_steps, NOISE_BLOCK)
+        action = policy(self._observation) + std * noise_block(self.seed, block, size, self._color)[row]
         return np.clip(action, -1.0, 1.0).astype(np.float32)
 
     def _step(self, action: np.ndarray) -> None:

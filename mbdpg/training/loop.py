@@ -14,9 +14,10 @@ import numpy as np
 from mbdpg.envs import episode_seed
 from mbdpg.interfaces import Environment, Metrics, Phase, require
 from mbdpg.networks.policy import NumpyPolicy
-from mbdpg.training.collector import Collector, random_stream
+from mbdpg.training.collector import Collector
 from mbdpg.training.evaluation import Evaluation, diagnosis_windows, evaluate
 from mbdpg.training.learner import Learner
+from mbdpg.training.randomness import random_stream
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from mbdpg.interfaces import UserError
 from mbdpg.training.loop import Schedule
 
 PACKAGE = Path(mbdpg.__file__).parent
+COMPOSED = PACKAGE / "experiments" / "run.py"
 
 SHARES = [("discount", 1.01), ("discount", -0.1), ("discount", float("nan")), ("target_update_rate", 2.0)]
 IMPOSSIBLE = [
@@ -65,8 +66,12 @@ def unread(config: type, files: list[Path], owners: set[str]) -> set[str]:
 @pytest.mark.parametrize(
     ("config", "files", "owners"),
     [
-        (model_based.Config, sorted((PACKAGE / "agents" / "mbdpg").glob("*.py")), {"c", "config"}),
-        (td3.Config, [PACKAGE / "agents" / "td3.py"], {"c", "config"}),
+        (
+            model_based.Config,
+            [*sorted((PACKAGE / "agents" / "mbdpg").glob("*.py")), COMPOSED],
+            {"c", "config", "agent"},
+        ),
+        (td3.Config, [PACKAGE / "agents" / "td3.py", COMPOSED], {"c", "config", "agent"}),
         (Schedule, [PACKAGE / "training" / "loop.py"], {"schedule", "_schedule"}),
     ],
     ids=["mbdpg", "td3", "schedule"],

@@ -84,8 +84,8 @@ def policy(observation: np.ndarray) -> np.ndarray:
     return np.tanh(observation[:1])
 
 
-def collector(world: World, *, seed: int = 3, random_steps: int = 10) -> Collector:
-    return Collector(world.make, seed, Replay(2, 1), random_steps=random_steps)
+def collector(world: World, *, seed: int = 3, random_steps: int = 10, color: float = 1.0) -> Collector:
+    return Collector(world.make, seed, Replay(2, 1), random_steps=random_steps, color=color)
 
 
 def bytes_of(replay: Replay) -> dict[str, bytes]:
@@ -258,7 +258,7 @@ def test_an_environment_that_cannot_be_made_again_at_once_is_tried_again() -> No
             raise error
         return world.make()
 
-    made = Collector(make, 3, Replay(2, 1), random_steps=10)
+    made = Collector(make, 3, Replay(2, 1), random_steps=10, color=1.0)
     made.collect(policy, 0.1, 40)
     assert (made.env_steps, made.faults) == (40, 3)
 
@@ -283,7 +283,7 @@ def test_a_restored_collector_goes_on_bitwise(steps: int) -> None:
     facts: dict[str, Any] = json.loads(json.dumps(first.facts()))
     world = World(failing_at(15 - steps) if steps <= 15 else no_fault)
     world.steps = -len(first.replay.open_episode()[1])  # those are played again, and not counted
-    second = Collector(world.make, 3, Replay.from_columns(first.replay.columns()), random_steps=10)
+    second = Collector(world.make, 3, Replay.from_columns(first.replay.columns()), random_steps=10, color=1.0)
     second.restore(facts)
     assert world.steps == 0
     cycles(second, 60 - steps)
@@ -301,7 +301,7 @@ def test_an_environment_that_does_not_repeat_itself_is_said_loudly_and_loses_tha
         first.collect(policy, 0.1, 1)
     world = World()
     world.drift = 1e-6
-    second = Collector(world.make, 3, Replay.from_columns(first.replay.columns()), random_steps=10)
+    second = Collector(world.make, 3, Replay.from_columns(first.replay.columns()), random_steps=10, color=1.0)
     second.restore(first.facts())
     said = capsys.readouterr().err
     assert "Walk-v0 did not repeat its open episode, so this resume is not exact" in said
@@ -322,7 +322,7 @@ def test_an_environment_that_fails_while_its_episode_is_played_again_does_not_en
     while not first.replay.episode_open:
         first.collect(policy, 0.1, 1)
     world = World(failing_at(moment))
-    second = Collector(world.make, 3, Replay.from_columns(first.replay.columns()), random_steps=10)
+    second = Collector(world.make, 3, Replay.from_columns(first.replay.columns()), random_steps=10, color=1.0)
     second.restore(first.facts())
     assert "this resume is not exact" in capsys.readouterr().err
     world.fault = no_fault

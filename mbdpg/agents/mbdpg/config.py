@@ -62,6 +62,8 @@ class Config:
     """Standard deviation of the behavior policy while returns are a random policy's."""
     final_exploration_std: float = 0.1
     """The same once returns reach the reference return; in between it follows the return."""
+    exploration_color: float = 1.0
+    """Noise of the behavior policy has power 1/f^color: 0 is white, 1 pink, correlated over many steps."""
     random_steps: int = 4000
     """Environment steps with uniformly random actions before learning starts."""
     fit_length: int = 10
