@@ -232,7 +232,8 @@ class MBDPG:
         seen = imagined.observations[c.first_value :]
         seen = jax.lax.stop_gradient(seen) if printed else seen
         values = objectives.clipped_value(state.critics(seen, imagined.actions[c.first_value :]))
-        survival = jax.lax.stop_gradient(imagined.survival())
+        survival = imagined.survival()
+        survival = survival if c.survival_gradient else jax.lax.stop_gradient(survival)
         objective = objectives.policy_objective(
             imagined.rewards, values, survival, discount=c.discount, beta=state.beta, reward_weights=c.reward_weights
         )
