@@ -233,7 +233,7 @@ class MBDPG:
         seen = jax.lax.stop_gradient(seen) if printed else seen
         values = objectives.clipped_value(state.critics(seen, imagined.actions[c.first_value :]))
         survival = imagined.survival()
-        survival = survival if c.survival_gradient else jax.lax.stop_gradient(survival)
+        survival = jax.lax.stop_gradient(survival) if printed else survival
         objective = objectives.policy_objective(
             imagined.rewards, values, survival, discount=c.discount, beta=state.beta, reward_weights=c.reward_weights
         )

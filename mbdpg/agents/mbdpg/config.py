@@ -44,8 +44,6 @@ class Config:
     """Reward t weighs beta times: the value terms after it ("remaining"), or one ("uniform", as printed)."""
     first_value: Literal[0, 1] = 0
     """Imagined step at which the value terms of Eq. 18 begin: 1 as printed, 0 to teach the first action by Q too."""
-    survival_gradient: bool = True
-    """Whether the policy gradient follows the probability of being alive, or takes it as a constant weight."""
     trace: float = 1.0
     """Lambda of the value expansion: 1 is Eq. 16, smaller values trust shorter expansions more."""
     imagined_weight: float = 0.5
