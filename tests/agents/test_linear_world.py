@@ -169,12 +169,15 @@ def test_without_rewards_the_eq19_gradient_is_that_of_ordinary_dpg() -> None:
 
 @pytest.mark.parametrize(("first_value", "reward_weights"), [(1, "uniform"), (0, "remaining")])
 def test_the_full_gradient_is_that_of_finite_differences(first_value: int, reward_weights: str) -> None:
-    """In float64, in the linear world's bends: tanh of the policy, the minimum of the critics."""
+    """In float64, in the linear world's bends: tanh of the policy, the minimum of the critics, survival."""
     settings = {"horizon": 3, "first_value": first_value, "reward_weights": reward_weights}
     agent = MBDPG(Config(saturation_penalty=0.0, discount=GAMMA, **settings), ENV)
+    mortal = eqx.tree_at(
+        lambda x: x.dynamics.trunk.output.weight, world(), replace_fn=lambda weight: weight.at[: O + A, -1].set(0.7)
+    )
     with jax.enable_x64(True):
         state, start = jax.tree.map(
-            lambda x: x.astype(jnp.float64) if x.dtype == jnp.float32 else x, (world(), start_states())
+            lambda x: x.astype(jnp.float64) if x.dtype == jnp.float32 else x, (mortal, start_states())
         )
         loss = jax.jit(agent._actor_loss)
         gradient = jax.jit(jax.grad(agent._actor_loss, has_aux=True))(state.actor, state, start, KEY)[0]
