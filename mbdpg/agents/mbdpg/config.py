@@ -82,7 +82,7 @@ class Config:
     """Negative log-likelihood of the mixture itself, or Eq. 11 as printed."""
     mean_weight: float = 1.0
     """Weight of the square error of the mixture's mean in the dynamics loss."""
-    dynamics_learning_rate: float = 3e-4
+    dynamics_learning_rate: float = 1e-3
     """Adam's step size for the dynamics."""
     dynamics_clip: float = 10.0
     """Global norm to which the dynamics' gradient is clipped."""
