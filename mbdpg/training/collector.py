@@ -131,6 +131,8 @@ class Collector:
             return random_stream(self.seed, "act", self.env_steps).uniform(-1.0, 1.0, size).astype(np.float32)
         assert self._observation is not None
         block, row = divmod(self.env_steps, NOISE_BLOCK)
+        # Some episodes look around, others show the model and the critics what the policy itself does.
+        std *= 2.0 * random_stream(self.seed, "spread", self.episode).uniform()
         action = policy(self._observation) + std * noise_block(self.seed, block, size, self._color)[row]
         return np.clip(action, -1.0, 1.0).astype(np.float32)
 
