@@ -49,22 +49,25 @@ def open_loop(
     start: Float[Array, "batch observation"],
     memory: Memory,
     actions: Float[Array, "batch time action"],
-) -> tuple[Prediction, Float[Array, "state batch observation"]]:
+) -> tuple[Prediction, Float[Array, "state batch observation"], Memory]:
     """Execute `actions` in the model from a real state, feeding its own predictions back (Fig. 2).
 
     Returns:
-        The predictions of every step, time first, and the observations passed through, from `start` to the last.
+        The predictions of every step, time first, the observations passed through, from `start` to the last, and the
+        memory after every step.
     """
 
-    def step(carry: tuple[Array, Memory], action: Array) -> tuple[tuple[Array, Memory], tuple[Prediction, Array]]:
+    def step(
+        carry: tuple[Array, Memory], action: Array
+    ) -> tuple[tuple[Array, Memory], tuple[Prediction, Array, Memory]]:
         observation, memory = carry
         memory = dynamics.remember(memory, observation, action)
         prediction = dynamics.predict(memory, observation, action)
         after = next_observation(observation, prediction.mean(), scales)
-        return (after, memory), (prediction, after)
+        return (after, memory), (prediction, after, memory)
 
-    prediction, reached = jax.lax.scan(step, (start, memory), jnp.swapaxes(actions, 0, 1))[1]
-    return prediction, jnp.concatenate([start[None], reached])
+    prediction, reached, memories = jax.lax.scan(step, (start, memory), jnp.swapaxes(actions, 0, 1))[1]
+    return prediction, jnp.concatenate([start[None], reached]), memories
 
 
 def mixture_nll(
@@ -97,12 +100,15 @@ def dynamics_loss(
 
     To the likelihood of the state and the squared error of the reward come the squared error of the mixture's mean
     (planning uses nothing else), the squared error of the terminal reward on terminal steps alone, and the cross
-    entropy of the continuation. Steps after an episode's end do not count.
+    entropy of the continuation. Rewards and ends are learned between the real ends of a step, with the memory of the
+    imagined ones. Steps after an episode's end do not count.
     """
     lead = slice(0, burn_in)
     memory = warm_memory(dynamics, window.observation[:, lead], window.action[:, lead], window.valid[:, lead])
     future = jax.tree.map(lambda x: jnp.swapaxes(x[:, burn_in:], 0, 1), window)
-    prediction, imagined = open_loop(dynamics, scales, future.observation[0], memory, jnp.swapaxes(future.action, 0, 1))
+    actions = jnp.swapaxes(future.action, 0, 1)
+    prediction, imagined, memories = open_loop(dynamics, scales, future.observation[0], memory, actions)
+    outcome = dynamics.outcome(memories, future.observation, future.action, future.next_observation)
     target = (future.next_observation - imagined[:-1]) / scales.delta.reshape(1, 1, -1)
     alive = future.valid * (1.0 - future.terminated)
     dead = future.valid * future.terminated
@@ -113,9 +119,9 @@ def dynamics_loss(
 
     nll = average(mixture_nll(prediction, target, likelihood), future.valid)
     mean_error = average(jnp.mean(jnp.square(prediction.mean() - target), axis=-1), future.valid)
-    reward_error = average(jnp.square(prediction.reward - future.reward), alive)
-    terminal_error = average(jnp.square(prediction.terminal_reward - future.terminal_reward), dead)
-    logit = prediction.continue_logit
+    reward_error = average(jnp.square(outcome.reward - future.reward), alive)
+    terminal_error = average(jnp.square(outcome.terminal_reward - future.terminal_reward), dead)
+    logit = outcome.continue_logit
     ending = average(jax.nn.softplus(-logit), alive) + average(jax.nn.softplus(logit), dead)
     loss = nll + mean_weight * mean_error + reward_error + terminal_error + ending
     weights = jnp.exp(prediction.log_weights)
@@ -139,7 +145,7 @@ def open_loop_error(
     lead = slice(0, burn_in)
     memory = warm_memory(dynamics, window.observation[:, lead], window.action[:, lead], window.valid[:, lead])
     start = window.observation[:, burn_in]
-    _, imagined = open_loop(dynamics, scales, start, memory, window.action[:, burn_in:])
+    imagined = open_loop(dynamics, scales, start, memory, window.action[:, burn_in:])[1]
     metrics: Metrics = {}
     for depth in depths:
         exists = window.valid[:, burn_in + depth - 1]

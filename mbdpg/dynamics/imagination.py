@@ -66,10 +66,12 @@ def imagine(
         memory = dynamics.remember(memory, observation, action)
         prediction = dynamics.predict(memory, observation, action)
         delta = prediction.mean() if key is None else prediction.sample(key=jax.random.fold_in(key, t))
-        alive = jax.nn.sigmoid(prediction.continue_logit)
-        reward = alive * prediction.reward * scales.reward
-        reward += (1.0 - alive) * prediction.terminal_reward * scales.terminal_reward
-        return (next_observation(observation, delta, scales), memory), (observation, action, reward, alive)
+        after = next_observation(observation, delta, scales)
+        outcome = dynamics.outcome(memory, observation, action, after)
+        alive = jax.nn.sigmoid(outcome.continue_logit)
+        reward = alive * outcome.reward * scales.reward
+        reward += (1.0 - alive) * outcome.terminal_reward * scales.terminal_reward
+        return (after, memory), (observation, action, reward, alive)
 
     (last, memory), (observations, actions, rewards, continues) = jax.lax.scan(
         step, (start, memory), jnp.arange(horizon), unroll=min(horizon, UNROLLED)
