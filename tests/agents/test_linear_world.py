@@ -1,7 +1,7 @@
 """What can be worked out by hand in a linear world: the gradients of Eq. 18 and 19, and the fixed point of Eq. 16.
 
 The world is an ordinary `MixtureDynamics` without hidden layers, so that its outputs are affine in observation and
-action; policy and critics have no hidden layers either.
+action (and rewards in the next observation too); policy and critics have no hidden layers either.
 """
 
 import functools
@@ -42,16 +42,19 @@ def without_layers(network: MLP, output: Linear) -> MLP:
 
 
 def linear_dynamics(rng: np.random.Generator, survival: float) -> MixtureDynamics:
-    """Means and both rewards affine in observation and action, blind to the memory; weights and survival constant."""
+    """Means and both rewards affine in what they see, blind to the memory; weights and survival constant."""
     dynamics = MixtureDynamics(O, A, gaussians=M, memory=MEMORY, widths=(8,), key=jax.random.key(0))
-    output = affine(rng, O + A + MEMORY, M * (O + 1) + 3, 0.1)
+    output = affine(rng, O + A + MEMORY, M * (O + 1), 0.1)
     gates = slice(M * O, M * O + M)
-    weight = output.weight.at[O + A :].set(0.0).at[:, gates].set(0.0).at[:, -1].set(0.0)
-    logit = np.inf if survival == 1 else np.log(survival / (1 - survival))
-    bias = output.bias.at[gates].set(jnp.log(jnp.asarray(ALPHA, jnp.float32))).at[-1].set(logit)
+    weight = output.weight.at[O + A :].set(0.0).at[:, gates].set(0.0)
+    bias = output.bias.at[gates].set(jnp.log(jnp.asarray(ALPHA, jnp.float32)))
     trunk = without_layers(dynamics.trunk, eqx.tree_at(lambda x: (x.weight, x.bias), output, (weight, bias)))
-    scale_head = affine(rng, O + A + MEMORY, M * O)
-    return eqx.tree_at(lambda x: (x.trunk, x.scale_head), dynamics, (trunk, scale_head))
+    outcome = affine(rng, O + A + O + MEMORY, 3, 0.3)
+    weight = outcome.weight.at[O + A + O :].set(0.0).at[:, -1].set(0.0)
+    bias = outcome.bias.at[-1].set(np.inf if survival == 1 else np.log(survival / (1 - survival)))
+    outcome = eqx.tree_at(lambda x: (x.weight, x.bias), outcome, (weight, bias))
+    heads = affine(rng, O + A + MEMORY, M * O), without_layers(dynamics.outcome_head, outcome)
+    return eqx.tree_at(lambda x: (x.trunk, x.scale_head, x.outcome_head), dynamics, (trunk, *heads))
 
 
 @functools.cache
@@ -79,7 +82,11 @@ def in_numpy(dynamics: MixtureDynamics) -> tuple[np.ndarray, ...]:
     rows = np.concatenate([weight, np.asarray(dynamics.trunk.output.bias, np.float64)[None]])
     means = rows[:, : M * O].reshape(O + A + 1, M, O)
     d = np.einsum("m,imo->oi", ALPHA, means) * DELTA[:, None]
-    return d, rows[:, -3] * REWARD, rows[:, -2] * TERMINAL_REWARD
+    head = dynamics.outcome_head.output
+    weight, bias = np.asarray(head.weight, np.float64), np.asarray(head.bias, np.float64)
+    now, after = np.concatenate([weight[: O + A], bias[None]]), weight[O + A : O + A + O]
+    rewards = now + (np.eye(O, O + A + 1) + d).T @ after  # s' = s + d [s a 1]
+    return d, rewards[:, 0] * REWARD, rewards[:, 1] * TERMINAL_REWARD
 
 
 KEY = jax.random.key(0)  # unused: planning is deterministic
@@ -105,7 +112,7 @@ def hand_written_eq_19(state: State, start: Start, horizon: int, first_value: in
     weight, bias = (np.asarray(x, np.float64) for x in (state.actor.mlp.output.weight, state.actor.mlp.output.bias))
     mlps = state.critics.mlps.output
     q = np.concatenate([np.asarray(mlps.weight, np.float64)[..., 0], np.asarray(mlps.bias, np.float64)], axis=1)
-    survival, beta = float(jax.nn.sigmoid(state.dynamics.trunk.output.bias[-1])), float(state.beta)
+    survival, beta = float(jax.nn.sigmoid(state.dynamics.outcome_head.output.bias[-1])), float(state.beta)
     reward = survival * w + (1 - survival) * v
     total = np.zeros((O + 1) * A)
     for s in np.asarray(start.observation, np.float64):
@@ -173,7 +180,7 @@ def test_the_full_gradient_is_that_of_finite_differences(first_value: int, rewar
     settings = {"horizon": 3, "first_value": first_value, "reward_weights": reward_weights}
     agent = MBDPG(Config(saturation_penalty=0.0, discount=GAMMA, **settings), ENV)
     mortal = eqx.tree_at(
-        lambda x: x.dynamics.trunk.output.weight, world(), replace_fn=lambda weight: weight.at[: O + A, -1].set(0.7)
+        lambda x: x.dynamics.outcome_head.output.weight, world(), replace_fn=lambda weight: weight.at[:8, -1].set(0.7)
     )
     with jax.enable_x64(True):
         state, start = jax.tree.map(

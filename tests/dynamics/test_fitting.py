@@ -127,22 +127,24 @@ def test_the_loss_is_numpys_sum_over_steps(dynamics: MixtureDynamics) -> None:
     w.valid[1, 0] = 0
     observation, action, valid = (jnp.asarray(x) for x in (w.observation, w.action, w.valid))
     memory = warm_memory(dynamics, observation[:, :BURN_IN], action[:, :BURN_IN], valid[:, :BURN_IN])
-    p, reached = open_loop(dynamics, SCALES, observation[:, BURN_IN], memory, action[:, BURN_IN:])
+    p, reached, memories = open_loop(dynamics, SCALES, observation[:, BURN_IN], memory, action[:, BURN_IN:])
+    ends = (jnp.swapaxes(x[:, BURN_IN:], 0, 1) for x in (w.observation, w.action, w.next_observation))
+    outcome = dynamics.outcome(memories, *ends)
     parts = dict.fromkeys(("nll", "mean_mse", "reward_mse", "terminal", "continue_bce"), 0.0)
     for i in range(BATCH):
         for t in range(LENGTH):
             if not w.valid[i, BURN_IN + t]:
                 continue
             change = (w.next_observation[i, BURN_IN + t] - np.asarray(reached[t, i])) / np.asarray(SCALES.delta)
-            one = jax.tree.map(lambda x, t=t, i=i: x[t, i], p)
+            one, brought = jax.tree.map(lambda x, t=t, i=i: x[t, i], (p, outcome))
             parts["nll"] += float(mixture_nll(one, jnp.asarray(change), "mixture"))
             parts["mean_mse"] += np.mean((change - np.asarray(one.mean())) ** 2)
-            lives = 1 / (1 + np.exp(-float(one.continue_logit)))
+            lives = 1 / (1 + np.exp(-float(brought.continue_logit)))
             if w.terminated[i, BURN_IN + t]:
-                parts["terminal"] += (float(one.terminal_reward) - w.terminal_reward[i, BURN_IN + t]) ** 2
+                parts["terminal"] += (float(brought.terminal_reward) - w.terminal_reward[i, BURN_IN + t]) ** 2
                 parts["continue_bce"] -= np.log(1 - lives)
             else:
-                parts["reward_mse"] += (float(one.reward) - w.reward[i, BURN_IN + t]) ** 2
+                parts["reward_mse"] += (float(brought.reward) - w.reward[i, BURN_IN + t]) ** 2
                 parts["continue_bce"] -= np.log(lives)
     parts = {name: part / w.valid[:, BURN_IN:].sum() for name, part in parts.items()}
     (loss, metrics), _ = compiled()(dynamics, w)
@@ -175,8 +177,9 @@ def test_the_gradient_reaches_memory_trunk_and_every_head(dynamics: MixtureDynam
     gradient = compiled()(dynamics, w)[1]
     for path, leaf in jax.tree_util.tree_leaves_with_path(gradient):
         assert np.asarray(leaf).any(), jax.tree_util.keystr(path)
-    assert np.asarray(gradient.trunk.output.bias).all()  # means, weights, reward, terminal reward, continuation
+    assert np.asarray(gradient.trunk.output.bias).all()  # means, weights
     assert np.asarray(gradient.scale_head.bias).all()
+    assert np.asarray(gradient.outcome_head.output.bias).all()  # reward, terminal reward, continuation
     assert all(part.any() for part in np.split(np.asarray(gradient.lstm.bias), 4))
 
 
@@ -204,9 +207,11 @@ def test_open_loop_is_imagination_with_the_actions_played_back(dynamics: Mixture
     memory = Memory(*(jnp.asarray(rng.normal(size=(BATCH, 4)), jnp.float32) for _ in range(2)))
     imagined = imagine(dynamics, SCALES, lambda s: jnp.tanh(s[..., :A]), start, memory, horizon=LENGTH)
     actions = jnp.swapaxes(imagined.actions[:-1], 0, 1)
-    p, reached = open_loop(dynamics, SCALES, start, memory, actions)
+    _, reached, memories = open_loop(dynamics, SCALES, start, memory, actions)
     np.testing.assert_allclose(reached, imagined.observations, atol=1e-5)
-    np.testing.assert_allclose(jax.nn.sigmoid(p.continue_logit), imagined.continues, atol=1e-5)
+    np.testing.assert_allclose(memories.cell[-1], imagined.memory.cell, atol=1e-5)
+    outcome = dynamics.outcome(memories, reached[:-1], imagined.actions[:-1], reached[1:])
+    np.testing.assert_allclose(jax.nn.sigmoid(outcome.continue_logit), imagined.continues, atol=1e-5)
 
 
 def test_open_loop_error_is_numpys_beside_that_of_no_change(dynamics: MixtureDynamics) -> None:
@@ -218,7 +223,7 @@ def test_open_loop_error_is_numpys_beside_that_of_no_change(dynamics: MixtureDyn
     past = slice(0, BURN_IN)
     memory = warm_memory(dynamics, w.observation[:, past], w.action[:, past], w.valid[:, past])
     start = w.observation[:, BURN_IN]
-    _, reached = open_loop(dynamics, SCALES, start, memory, w.action[:, BURN_IN:])
+    reached = open_loop(dynamics, SCALES, start, memory, w.action[:, BURN_IN:])[1]
     assert set(metrics) == {f"dynamics/{name}_k{depth:02d}" for name in ("rmse", "persistence") for depth in (1, 3)}
     for depth, rows in ((1, [0, 1, 2]), (3, [1, 2])):
         truth = np.asarray(w.next_observation)[rows, BURN_IN + depth - 1]

@@ -29,7 +29,7 @@ def prediction(rng: np.random.Generator, *lead: int) -> Prediction:
     def draw(*shape: int) -> jax.Array:
         return jnp.asarray(rng.normal(size=(*lead, *shape)), jnp.float32)
 
-    return Prediction(jax.nn.log_softmax(draw(M)), draw(M, O), 0.5 * draw(M, O), draw(), draw(), draw())
+    return Prediction(jax.nn.log_softmax(draw(M)), draw(M, O), 0.5 * draw(M, O))
 
 
 def pair(rng: np.random.Generator, *lead: int) -> tuple[jax.Array, jax.Array]:
@@ -103,7 +103,7 @@ def test_a_sample_comes_from_one_gaussian_not_from_their_average() -> None:
     """Eq. 6 taken literally would average; all entries of one sample share a Gaussian, samples in a batch do not."""
     means = jnp.broadcast_to(10.0 * jnp.arange(M, dtype=jnp.float32)[:, None], (M, O))
     log_weights = jnp.log(jnp.asarray([0.1, 0.2, 0.3, 0.4]))
-    one = Prediction(log_weights, means, jnp.full((M, O), -5.0), *(jnp.zeros(()),) * 3)
+    one = Prediction(log_weights, means, jnp.full((M, O), -5.0))
     many = jax.tree.map(lambda x: jnp.broadcast_to(x, (4000, *x.shape)), one)
     samples = np.asarray(many.sample(key=jax.random.key(0))) / 10
     which = np.rint(samples)
@@ -149,30 +149,35 @@ def test_every_output_belongs_to_one_head(dynamics: MixtureDynamics) -> None:
     jacobian = jax.jacobian(heads)(dynamics.trunk.output.bias)
     used = [np.abs(leaf).reshape(-1, leaf.shape[-1]).sum(axis=0) > 0 for leaf in jacobian]
     sizes = dict(zip(Prediction._fields, [mask.sum() for mask in used], strict=True))
-    assert sizes == {
-        "log_weights": M,
-        "means": M * O,
-        "log_stds": 0,
-        "reward": 1,
-        "terminal_reward": 1,
-        "continue_logit": 1,
-    }
-    assert np.sum(used, axis=0).tolist() == [1] * (M * (O + 1) + 3)
+    assert sizes == {"log_weights": M, "means": M * O, "log_stds": 0}
+    assert np.sum(used, axis=0).tolist() == [1] * (M * (O + 1))
 
 
 def test_a_prediction_is_a_mixture_within_its_bounds(dynamics: MixtureDynamics) -> None:
     observation, action = pair(np.random.default_rng(8), 2, BATCH)
     loud = jax.tree.map(lambda x: 50 * x, dynamics)
     p = loud.predict(loud.initial_memory((2, BATCH)), observation, action)
-    assert [leaf.shape[2:] for leaf in p] == [(M,), (M, O), (M, O), (), (), ()]
+    assert [leaf.shape[2:] for leaf in p] == [(M,), (M, O), (M, O)]
     np.testing.assert_allclose(jnp.sum(jnp.exp(p.log_weights), axis=-1), 1.0, rtol=1e-5)
     assert jnp.min(p.log_stds) >= LOG_STD_MIN and jnp.max(p.log_stds) <= LOG_STD_MAX
     assert jnp.min(p.log_stds) < LOG_STD_MIN + 1 and jnp.max(p.log_stds) > LOG_STD_MAX - 1
 
 
 def test_a_fresh_model_expects_to_live_on(dynamics: MixtureDynamics) -> None:
-    p = dynamics.predict(dynamics.initial_memory((BATCH,)), *pair(np.random.default_rng(9), BATCH))
-    assert 0.9 < float(jnp.mean(jax.nn.sigmoid(p.continue_logit))) < 0.999
+    observation, action = pair(np.random.default_rng(9), BATCH)
+    outcome = dynamics.outcome(dynamics.initial_memory((BATCH,)), observation, action, observation)
+    assert [leaf.shape for leaf in outcome] == [(BATCH,)] * 3
+    assert 0.9 < float(jnp.mean(jax.nn.sigmoid(outcome.continue_logit))) < 0.999
+
+
+@pytest.mark.parametrize("read", ["observation", "action", "after", "memory"])
+def test_an_outcome_depends_on_both_ends_of_the_step_and_on_the_memory(dynamics: MixtureDynamics, read: str) -> None:
+    observation, action = pair(np.random.default_rng(9), BATCH)
+    step = {"observation": observation, "action": action, "after": observation + 1}
+    step["memory"] = Memory(jnp.ones((BATCH, MEMORY)), jnp.ones((BATCH, MEMORY)))
+    moved = step | {read: jax.tree.map(lambda x: x + 0.5, step[read])}
+    for before, after in zip(dynamics.outcome(**step), dynamics.outcome(**moved), strict=True):
+        assert (jnp.abs(before - after) > 0).all()
 
 
 @pytest.mark.parametrize("lead", [(), (4,), (2, 4)])
