@@ -39,7 +39,7 @@ class Config:
     target_noise_clip: float = 0.5
     """Bound of that noise."""
     exploration_std: float = 0.1
-    """Standard deviation of the Gaussian behavior policy."""
+    """Standard deviation of the Gaussian behavior policy, its mean over episodes."""
     exploration_color: float = 0.0
     """Noise of the behavior policy has power 1/f^color: 0 is white, 1 pink, correlated over many steps."""
     random_steps: int = 4000

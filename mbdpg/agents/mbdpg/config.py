@@ -59,7 +59,7 @@ class Config:
     target_noise: float = 0.2
     """Standard deviation of the noise on target actions."""
     exploration_std: float = 0.3
-    """Standard deviation of the behavior policy while returns are a random policy's."""
+    """Standard deviation of the behavior policy, its mean over episodes, while returns are a random policy's."""
     final_exploration_std: float = 0.1
     """The same once returns reach the reference return; in between it follows the return."""
     exploration_color: float = 1.0
