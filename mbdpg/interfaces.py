@@ -167,7 +167,7 @@ class Agent(Protocol):
 
     @property
     def config(self) -> Any:
-        """Its own Config; every one has `discount`, `random_steps` and `exploration_color`."""
+        """Its own Config; every one has `discount` and what collecting asks for."""
 
     @property
     def env(self) -> EnvSpec: ...

@@ -30,6 +30,7 @@ class ToyConfig:
     discount: float = 0.9
     random_steps: int = 20
     exploration_color: float = 0.0
+    exploration_scatter: float = 0.0
     width: int = 3
 
 
@@ -176,7 +177,9 @@ def toy_training(
     )
     recorders = [ToyRecorder() for _ in seeds]
     collectors = [
-        Collector(ToyEnv, seed, replay or Replay(2, 1), random_steps=learner.agent.config.random_steps, color=0.0)
+        Collector(
+            ToyEnv, seed, replay or Replay(2, 1), random_steps=learner.agent.config.random_steps, color=0.0, scatter=0.0
+        )
         for seed in seeds
     ]
     return Training(learner, collectors, make_env, recorders, schedule), recorders

@@ -42,6 +42,8 @@ class Config:
     """Standard deviation of the Gaussian behavior policy, its mean over episodes."""
     exploration_color: float = 0.0
     """Noise of the behavior policy has power 1/f^color: 0 is white, 1 pink, correlated over many steps."""
+    exploration_scatter: float = 0.0
+    """Every episode's spread is drawn uniformly from within this share of its mean, from none to twice as much at 1."""
     random_steps: int = 4000
     """Environment steps with uniformly random actions before learning starts."""
     width: int = 256
@@ -51,7 +53,7 @@ class Config:
         require_settings(
             self,
             positive=("batch_size", "updates_per_step", "policy_delay", "learning_rate", "width"),
-            shares=("discount", "target_update_rate"),
+            shares=("discount", "target_update_rate", "exploration_scatter"),
         )
 
 

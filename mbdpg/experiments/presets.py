@@ -30,6 +30,7 @@ PAPER: dict[str, dict[str, Any]] = {
         "target_update_rate": 1.0,
         "target_update_every": 3,
         "exploration_color": 0.0,
+        "exploration_scatter": 0.0,
         "random_steps": 4000,
         "fit_length": 10,
         "burn_in": 190,

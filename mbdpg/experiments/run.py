@@ -217,8 +217,16 @@ def _compose(
         elif demonstrations:
             replay.extend(demonstrations.replay.columns())
             replay.demonstrated = replay.size
-        random_steps, color = config.agent.random_steps, config.agent.exploration_color
-        collectors.append(Collector(make, seed, replay, random_steps=random_steps, color=color))
+        collectors.append(
+            Collector(
+                make,
+                seed,
+                replay,
+                random_steps=config.agent.random_steps,
+                color=config.agent.exploration_color,
+                scatter=config.agent.exploration_scatter,
+            )
+        )
         stack.callback(collectors[-1].close)
     training = Training(
         Learner(agent, seeds),

@@ -31,9 +31,25 @@ class Collector:
     """
 
     def __init__(
-        self, make_env: Callable[[], Environment], seed: int, replay: Replay, *, random_steps: int, color: float
+        self,
+        make_env: Callable[[], Environment],
+        seed: int,
+        replay: Replay,
+        *,
+        random_steps: int,
+        color: float,
+        scatter: float,
     ):
-        """Start the first episode; the replay may hold demonstrations already."""
+        """Start the first episode; the replay may hold demonstrations already.
+
+        Args:
+            make_env: makes the environment, again after a fault.
+            seed: decides episodes and noise.
+            replay: gets every step.
+            random_steps: environment steps with uniformly random actions, before the policy is asked.
+            color: exponent of the noise's spectrum, 1 / f^color.
+            scatter: each episode's noise is scaled by a uniform draw from [1 - scatter, 1 + scatter].
+        """
         self.seed = seed
         self.replay = replay
         self.env_steps = 0
@@ -43,6 +59,7 @@ class Collector:
         self.baseline: float | None = None
         self._random_steps = random_steps
         self._color = color
+        self._scatter = scatter
         self._make_env = make_env
         self._env = make_env()
         self._broken = False
@@ -131,8 +148,7 @@ class Collector:
             return random_stream(self.seed, "act", self.env_steps).uniform(-1.0, 1.0, size).astype(np.float32)
         assert self._observation is not None
         block, row = divmod(self.env_steps, NOISE_BLOCK)
-        # Some episodes look around, others show the model and the critics what the policy itself does.
-        std *= 2.0 * random_stream(self.seed, "spread", self.episode).uniform()
+        std *= 1.0 + self._scatter * random_stream(self.seed, "scatter", self.episode).uniform(-1.0, 1.0)
         action = policy(self._observation) + std * noise_block(self.seed, block, size, self._color)[row]
         return np.clip(action, -1.0, 1.0).astype(np.float32)
 

@@ -84,8 +84,8 @@ def policy(observation: np.ndarray) -> np.ndarray:
     return np.tanh(observation[:1])
 
 
-def collector(world: World, *, seed: int = 3, random_steps: int = 10, color: float = 1.0) -> Collector:
-    return Collector(world.make, seed, Replay(2, 1), random_steps=random_steps, color=color)
+def collector(world: World, *, seed: int = 3, random_steps: int = 10, scatter: float = 1.0) -> Collector:
+    return Collector(world.make, seed, Replay(2, 1), random_steps=random_steps, color=1.0, scatter=scatter)
 
 
 def bytes_of(replay: Replay) -> dict[str, bytes]:
@@ -113,18 +113,25 @@ def test_the_first_steps_are_uniform_and_know_no_policy() -> None:
     assert asked
 
 
-def test_after_them_the_policy_acts_with_noise_that_is_larger_in_some_episodes_and_inside_the_bounds() -> None:
+def test_after_them_the_policy_acts_with_noise_of_the_given_size_inside_the_bounds() -> None:
+    world = World()
+    made = collector(world, random_steps=0, scatter=0.0)
+    made.collect(lambda observation: np.zeros(1, np.float32), 0.3, 2000)
+    actions = np.concatenate(world.actions)
+    assert abs(actions.mean()) < 0.03 and abs(actions.std() - 0.3) < 0.03
+    made.collect(lambda observation: np.ones(1, np.float32), 5.0, 200)
+    assert np.abs(np.concatenate(world.actions)).max() == 1
+
+
+def test_where_noise_is_scattered_some_episodes_have_little_and_others_much() -> None:
     world = World()
     made = collector(world, random_steps=0)
     made.collect(lambda observation: np.zeros(1, np.float32), 0.3, 4000)
     actions = np.concatenate(world.actions)
-    assert abs(actions.mean()) < 0.03
     columns = made.replay.columns()
     spreads = np.array([actions[columns["start"] == start].std() for start in np.unique(columns["start"])])
     assert spreads.min() < 0.05 and spreads.max() > 0.5
     assert np.sqrt(np.mean(actions**2)) == pytest.approx(0.3 * 2 / np.sqrt(3), rel=0.1)  # of a uniform spread
-    made.collect(lambda observation: np.ones(1, np.float32), 5.0, 200)
-    assert np.abs(np.concatenate(world.actions)).max() == 1
 
 
 def test_without_noise_the_action_is_the_policy_s() -> None:
@@ -260,7 +267,7 @@ def test_an_environment_that_cannot_be_made_again_at_once_is_tried_again() -> No
             raise error
         return world.make()
 
-    made = Collector(make, 3, Replay(2, 1), random_steps=10, color=1.0)
+    made = Collector(make, 3, Replay(2, 1), random_steps=10, color=1.0, scatter=1.0)
     made.collect(policy, 0.1, 40)
     assert (made.env_steps, made.faults) == (40, 3)
 
@@ -285,7 +292,9 @@ def test_a_restored_collector_goes_on_bitwise(steps: int) -> None:
     facts: dict[str, Any] = json.loads(json.dumps(first.facts()))
     world = World(failing_at(15 - steps) if steps <= 15 else no_fault)
     world.steps = -len(first.replay.open_episode()[1])  # those are played again, and not counted
-    second = Collector(world.make, 3, Replay.from_columns(first.replay.columns()), random_steps=10, color=1.0)
+    second = Collector(
+        world.make, 3, Replay.from_columns(first.replay.columns()), random_steps=10, color=1.0, scatter=1.0
+    )
     second.restore(facts)
     assert world.steps == 0
     cycles(second, 60 - steps)
@@ -303,7 +312,9 @@ def test_an_environment_that_does_not_repeat_itself_is_said_loudly_and_loses_tha
         first.collect(policy, 0.1, 1)
     world = World()
     world.drift = 1e-6
-    second = Collector(world.make, 3, Replay.from_columns(first.replay.columns()), random_steps=10, color=1.0)
+    second = Collector(
+        world.make, 3, Replay.from_columns(first.replay.columns()), random_steps=10, color=1.0, scatter=1.0
+    )
     second.restore(first.facts())
     said = capsys.readouterr().err
     assert "Walk-v0 did not repeat its open episode, so this resume is not exact" in said
@@ -324,7 +335,9 @@ def test_an_environment_that_fails_while_its_episode_is_played_again_does_not_en
     while not first.replay.episode_open:
         first.collect(policy, 0.1, 1)
     world = World(failing_at(moment))
-    second = Collector(world.make, 3, Replay.from_columns(first.replay.columns()), random_steps=10, color=1.0)
+    second = Collector(
+        world.make, 3, Replay.from_columns(first.replay.columns()), random_steps=10, color=1.0, scatter=1.0
+    )
     second.restore(first.facts())
     assert "this resume is not exact" in capsys.readouterr().err
     world.fault = no_fault

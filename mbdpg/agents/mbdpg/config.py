@@ -64,6 +64,8 @@ class Config:
     """The same once returns reach the reference return; in between it follows the return."""
     exploration_color: float = 1.0
     """Noise of the behavior policy has power 1/f^color: 0 is white, 1 pink, correlated over many steps."""
+    exploration_scatter: float = 1.0
+    """Every episode's spread is drawn uniformly from within this share of its mean, from none to twice as much at 1."""
     random_steps: int = 4000
     """Environment steps with uniformly random actions before learning starts."""
     fit_length: int = 10
@@ -101,5 +103,5 @@ class Config:
                 *("actor_clip", "critic_clip", "target_update_every", "fit_length", "fit_batch_size", "fits_per_step"),
                 *("dynamics_learning_rate", "dynamics_clip", "gaussians", "memory", "width"),
             ),
-            shares=("discount", "trace", "imagination_ratio", "target_update_rate"),
+            shares=("discount", "trace", "imagination_ratio", "target_update_rate", "exploration_scatter"),
         )
