@@ -167,7 +167,7 @@ class Agent(Protocol):
 
     @property
     def config(self) -> Any:
-        """Its own Config; every one has `discount` and what collecting asks for."""
+        """Its own Config; every one has `discount`, `random_steps`, `exploration_color` and `exploration_scatter`."""
 
     @property
     def env(self) -> EnvSpec: ...
@@ -185,7 +185,7 @@ class Agent(Protocol):
         """The deterministic policy and its observation normalizer."""
 
     def exploration_std(self, state: Any) -> Any:
-        """Standard deviation of the Gaussian behavior policy, in units of the action range's half."""
+        """Standard deviation of the behavior policy, its mean over episodes, in units of the action range's half."""
 
     def diagnose(self, state: Any, batch: Batch, realized_return: Any) -> Metrics:
         """Instruments on evaluation episodes that learning has never seen; sampled as `diagnosis` says.

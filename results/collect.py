@@ -21,6 +21,7 @@ COLUMNS = (
     "dynamics/persistence_k05",
     "dynamics/rmse_k20",
     "dynamics/persistence_k20",
+    "dynamics/reward_bias",
     "dynamics/survival_imagined",
     "dynamics/survival_observed",
     "critic/q_bias",

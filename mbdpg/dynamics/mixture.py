@@ -59,7 +59,7 @@ class Prediction(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What a step brings beside the next observation; each the mean of what may happen."""
+    """What a step brings beside the next observation: the mean of what may happen between its two ends."""
 
     reward: Float[Array, "*batch"]
     """Of a step that does not end the episode."""
@@ -79,7 +79,7 @@ class MixtureDynamics(eqx.Module):
     lstm: Linear
     trunk: MLP
     scale_head: Linear
-    outcome_head: MLP
+    outcome_network: MLP
     gaussians: int = eqx.field(static=True)
     observation_size: int = eqx.field(static=True)
 
@@ -101,10 +101,10 @@ class MixtureDynamics(eqx.Module):
         outputs = gaussians * (observation_size + 1)
         self.trunk = MLP(pair + memory, widths, outputs, output_scale=0.1, key=trunk_key)
         self.scale_head = Linear(widths[-1], gaussians * observation_size, scale=0.1, key=scale_key)
-        inputs, narrow = pair + observation_size + memory, (widths[-1] // 2,) * 2
+        inputs, narrow = pair + observation_size + memory, (max(widths[-1] // 2, 1),) * 2
         outcome = MLP(inputs, narrow, 3, output_scale=0.1, key=outcome_key)
         # Episodes rarely end: start from a survival of 98 % per step, not 50 %.
-        self.outcome_head = eqx.tree_at(lambda m: m.output.bias, outcome, outcome.output.bias.at[-1].set(4.0))
+        self.outcome_network = eqx.tree_at(lambda m: m.output.bias, outcome, outcome.output.bias.at[-1].set(4.0))
         self.gaussians, self.observation_size = gaussians, observation_size
 
     def initial_memory(self, batch: tuple[int, ...]) -> Memory:
@@ -145,11 +145,12 @@ class MixtureDynamics(eqx.Module):
     ) -> Outcome:
         """Reward and end of the step to `after`, from the memory that has already seen observation and action.
 
-        Most of what looks like noise in a reward is noise of the next observation: from both ends of a step a reward
-        is learned with far less error, above all with less error that is the same at every step, which a value sums.
+        Much of what looks like noise in a reward is noise of the next observation. A reward that is learned from both
+        ends of a step has less error that is the same at every step, which a value would sum (STEVE, Buckman et al.
+        2018, does so too).
         """
         reward, terminal_reward, continue_logit = jnp.moveaxis(
-            self.outcome_head(jnp.concatenate([observation, action, after, memory.hidden], axis=-1)), -1, 0
+            self.outcome_network(jnp.concatenate([observation, action, after, memory.hidden], axis=-1)), -1, 0
         )
         return Outcome(reward, terminal_reward, continue_logit)
 

@@ -145,7 +145,7 @@ class Collector:
     def _action(self, policy: Callable[[np.ndarray], np.ndarray], std: float) -> np.ndarray:
         size = self._env.spec.action_size
         if self.env_steps < self._random_steps:
-            return random_stream(self.seed, "act", self.env_steps).uniform(-1.0, 1.0, size).astype(np.float32)
+            return random_stream(self.seed, "uniform", self.env_steps).uniform(-1.0, 1.0, size).astype(np.float32)
         assert self._observation is not None
         block, row = divmod(self.env_steps, NOISE_BLOCK)
         std *= 1.0 + self._scatter * random_stream(self.seed, "scatter", self.episode).uniform(-1.0, 1.0)

@@ -20,13 +20,15 @@ NOISE_BLOCK = 1024
 def noise_block(seed: int, block: int, size: int, color: float) -> np.ndarray:
     """Gaussian noise of unit variance whose power falls with frequency as 1/f^color, shape (NOISE_BLOCK, size).
 
-    Timmer and Koenig 1995; for exploration Eberhard et al. 2023: 0 is white, 1 pink, 2 red.
+    Timmer and Koenig 1995; for exploration Eberhard et al. 2023: 0 is white, 1 pink, 2 red. A block sums to zero, and
+    the next one does not continue it.
     """
     frequencies = np.fft.rfftfreq(NOISE_BLOCK)[1:, None]
     amplitudes = frequencies ** (-color / 2)
     amplitudes[-1] /= np.sqrt(2)  # what is alone at its frequency, without a complex conjugate
-    normal = random_stream(seed, "act", block).standard_normal((2, *amplitudes.shape[:1], size))
+    normal = random_stream(seed, "noise", block).standard_normal((2, *amplitudes.shape[:1], size))
     spectrum = np.concatenate([np.zeros((1, size)), amplitudes * (normal[0] + 1j * normal[1])])
-    spectrum[-1] = spectrum[-1].real * np.sqrt(2)
-    noise = np.fft.irfft(spectrum, NOISE_BLOCK, axis=0)
-    return noise * NOISE_BLOCK / np.sqrt(4 * np.sum(amplitudes**2))
+    spectrum[-1] = 2 * spectrum[-1].real
+    noise = np.fft.irfft(spectrum, NOISE_BLOCK, axis=0) * NOISE_BLOCK / np.sqrt(4 * np.sum(amplitudes**2))
+    noise.flags.writeable = False  # it is cached
+    return np.asarray(noise)

@@ -53,8 +53,8 @@ def linear_dynamics(rng: np.random.Generator, survival: float) -> MixtureDynamic
     weight = outcome.weight.at[O + A + O :].set(0.0).at[:, -1].set(0.0)
     bias = outcome.bias.at[-1].set(np.inf if survival == 1 else np.log(survival / (1 - survival)))
     outcome = eqx.tree_at(lambda x: (x.weight, x.bias), outcome, (weight, bias))
-    heads = affine(rng, O + A + MEMORY, M * O), without_layers(dynamics.outcome_head, outcome)
-    return eqx.tree_at(lambda x: (x.trunk, x.scale_head, x.outcome_head), dynamics, (trunk, *heads))
+    heads = affine(rng, O + A + MEMORY, M * O), without_layers(dynamics.outcome_network, outcome)
+    return eqx.tree_at(lambda x: (x.trunk, x.scale_head, x.outcome_network), dynamics, (trunk, *heads))
 
 
 @functools.cache
@@ -76,13 +76,20 @@ def world(survival: float = 0.8) -> State:
     )
 
 
+def mortal_world() -> State:
+    """The same, but that survival depends on both ends of a step and on the action."""
+    return eqx.tree_at(
+        lambda x: x.dynamics.outcome_network.output.weight, world(), replace_fn=lambda w: w.at[: 2 * O + A, -1].set(0.7)
+    )
+
+
 def in_numpy(dynamics: MixtureDynamics) -> tuple[np.ndarray, ...]:
     """d, w and v with s' = s + d [s a 1], r = w [s a 1] and terminal reward v [s a 1], in units of value."""
     weight = np.asarray(dynamics.trunk.output.weight, np.float64)[: O + A]
     rows = np.concatenate([weight, np.asarray(dynamics.trunk.output.bias, np.float64)[None]])
     means = rows[:, : M * O].reshape(O + A + 1, M, O)
     d = np.einsum("m,imo->oi", ALPHA, means) * DELTA[:, None]
-    head = dynamics.outcome_head.output
+    head = dynamics.outcome_network.output
     weight, bias = np.asarray(head.weight, np.float64), np.asarray(head.bias, np.float64)
     now, after = np.concatenate([weight[: O + A], bias[None]]), weight[O + A : O + A + O]
     rewards = now + (np.eye(O, O + A + 1) + d).T @ after  # s' = s + d [s a 1]
@@ -112,7 +119,7 @@ def hand_written_eq_19(state: State, start: Start, horizon: int, first_value: in
     weight, bias = (np.asarray(x, np.float64) for x in (state.actor.mlp.output.weight, state.actor.mlp.output.bias))
     mlps = state.critics.mlps.output
     q = np.concatenate([np.asarray(mlps.weight, np.float64)[..., 0], np.asarray(mlps.bias, np.float64)], axis=1)
-    survival, beta = float(jax.nn.sigmoid(state.dynamics.outcome_head.output.bias[-1])), float(state.beta)
+    survival, beta = float(jax.nn.sigmoid(state.dynamics.outcome_network.output.bias[-1])), float(state.beta)
     reward = survival * w + (1 - survival) * v
     total = np.zeros((O + 1) * A)
     for s in np.asarray(start.observation, np.float64):
@@ -158,16 +165,16 @@ def test_both_critics_decide_in_the_eq19_test() -> None:
 
 
 def test_without_rewards_the_eq19_gradient_is_that_of_ordinary_dpg() -> None:
-    state, start = eqx.tree_at(lambda x: x.beta, world(), jnp.zeros(())), start_states()
+    state, start = eqx.tree_at(lambda x: x.beta, mortal_world(), jnp.zeros(())), start_states()
     gradient, metrics = policy_gradient(state, start, gradient="eq19", horizon=1, first_value=0)
     assert abs(metrics["actor/objective"]) < 1  # so the loss is not divided by its size
     after = imagine(state.dynamics, state.scales, state.actor, start.observation, start.memory, horizon=1)
 
     def deterministic_policy_gradient(actor: Policy) -> jax.Array:
         total = jnp.zeros(())
-        for t, survival in enumerate((1.0, 0.8)):
+        for t, survival in enumerate(after.survival()):
             states = after.observations[t]  # a batch of given states
-            total += GAMMA**t * survival * jnp.mean(jnp.min(state.critics(states, actor(states)), axis=0))
+            total += GAMMA**t * jnp.mean(survival * jnp.min(state.critics(states, actor(states)), axis=0))
         return total / 2
 
     expected = jax.grad(deterministic_policy_gradient)(state.actor)
@@ -179,12 +186,9 @@ def test_the_full_gradient_is_that_of_finite_differences(first_value: int, rewar
     """In float64, in the linear world's bends: tanh of the policy, the minimum of the critics, survival."""
     settings = {"horizon": 3, "first_value": first_value, "reward_weights": reward_weights}
     agent = MBDPG(Config(saturation_penalty=0.0, discount=GAMMA, **settings), ENV)
-    mortal = eqx.tree_at(
-        lambda x: x.dynamics.outcome_head.output.weight, world(), replace_fn=lambda weight: weight.at[:8, -1].set(0.7)
-    )
     with jax.enable_x64(True):
         state, start = jax.tree.map(
-            lambda x: x.astype(jnp.float64) if x.dtype == jnp.float32 else x, (mortal, start_states())
+            lambda x: x.astype(jnp.float64) if x.dtype == jnp.float32 else x, (mortal_world(), start_states())
         )
         loss = jax.jit(agent._actor_loss)
         gradient = jax.jit(jax.grad(agent._actor_loss, has_aux=True))(state.actor, state, start, KEY)[0]

@@ -318,13 +318,20 @@ def test_the_instruments_are_finite_and_named_as_documented() -> None:
     metrics = diagnose(state(), windows, realized)
     depths = ("k01", "k05", "k10", "k20")
     names = {f"dynamics/{name}_{depth}" for name in ("rmse", "persistence") for depth in depths}
-    names |= {"dynamics/survival_imagined", "dynamics/survival_observed", "dynamics/out_of_range"}
+    names |= {
+        "dynamics/survival_imagined",
+        "dynamics/survival_observed",
+        "dynamics/out_of_range",
+        "dynamics/reward_bias",
+    }
     names |= {"critic/q_bias", "critic/realized_return", "actor/grad_norm_k01"}
     assert set(metrics) == names
     assert all(value.shape == () for value in metrics.values()) and finite(metrics)
     assert float(metrics["dynamics/survival_observed"]) == 0.75
     assert float(metrics["critic/realized_return"]) == 1.5
     assert float(metrics["actor/grad_norm_k01"]) > 0
+    richer = diagnose(state(), windows._replace(reward=windows.reward + 1), realized)
+    assert float(metrics["dynamics/reward_bias"] - richer["dynamics/reward_bias"]) == pytest.approx(1.0, rel=1e-3)
     moved = state()
     value = jnp.min(
         moved.critics(

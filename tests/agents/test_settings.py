@@ -15,6 +15,7 @@ PACKAGE = Path(mbdpg.__file__).parent
 COMPOSED = PACKAGE / "experiments" / "run.py"
 
 SHARES = [("discount", 1.01), ("discount", -0.1), ("discount", float("nan")), ("target_update_rate", 2.0)]
+SHARES += [("exploration_scatter", 1.5)]
 IMPOSSIBLE = [
     *((model_based.Config, name, value) for name, value in SHARES),
     *((td3.Config, name, value) for name, value in SHARES),
@@ -28,6 +29,8 @@ IMPOSSIBLE = [
     (model_based.Config, "actor_clip", 0.0),
     (model_based.Config, "beta", -1.0),
     (model_based.Config, "exploration_std", float("nan")),
+    (model_based.Config, "exploration_color", 2.5),
+    (td3.Config, "exploration_color", float("nan")),
     (model_based.Config, "burn_in", -1),
     (model_based.Config, "fit_length", 0),
     (model_based.Config, "gaussians", 0),

@@ -179,7 +179,7 @@ def test_the_gradient_reaches_memory_trunk_and_every_head(dynamics: MixtureDynam
         assert np.asarray(leaf).any(), jax.tree_util.keystr(path)
     assert np.asarray(gradient.trunk.output.bias).all()  # means, weights
     assert np.asarray(gradient.scale_head.bias).all()
-    assert np.asarray(gradient.outcome_head.output.bias).all()  # reward, terminal reward, continuation
+    assert np.asarray(gradient.outcome_network.output.bias).all()  # reward, terminal reward, continuation
     assert all(part.any() for part in np.split(np.asarray(gradient.lstm.bias), 4))
 
 

@@ -12,6 +12,7 @@ import pytest
 from mbdpg.envs import episode_seed
 from mbdpg.interfaces import EnvSpec, NonFiniteError, Step, UserError
 from mbdpg.training.collector import FAULTS_IN_A_ROW, Collector
+from mbdpg.training.randomness import NOISE_BLOCK, noise_block
 from mbdpg.training.replay import Replay
 
 SPEC = EnvSpec("Walk-v0", observation_size=2, action_size=1, episode_limit=None, reference_return=10.0)
@@ -283,6 +284,15 @@ def cycles(made: Collector, count: int) -> Collector:
     for _ in range(count):
         made.collect(policy, 0.1, 1)
     return made
+
+
+def test_noise_is_correlated_over_its_whole_block_and_the_next_block_is_another() -> None:
+    world = World()
+    made = collector(world, random_steps=0, scatter=0.0)
+    made.env_steps = NOISE_BLOCK - 6
+    made.collect(lambda observation: np.zeros(1, np.float32), 0.1, 12)
+    expected = np.concatenate([noise_block(3, 0, 1, 1.0)[-6:], noise_block(3, 1, 1, 1.0)[:6]])
+    np.testing.assert_allclose(np.concatenate(world.actions), 0.1 * expected[:, 0], rtol=1e-6)
 
 
 @pytest.mark.parametrize("steps", [0, 1, 9, 10, 11, 15, 16, 23, 24, 25, 26, 27])

@@ -13,7 +13,9 @@ def test_the_power_of_noise_falls_with_frequency_as_its_color_says(color: float)
     noise = np.stack([noise_block(3, block, 4, color) for block in range(100)])
     assert noise.shape == (100, 1024, 4)
     assert np.mean(noise**2) == pytest.approx(1.0, rel=0.1)
+    np.testing.assert_allclose(noise.sum(axis=1), 0.0, atol=1e-9)
     assert np.abs(np.mean(noise[..., 0] * noise[..., 1])) < 0.05  # every action has its own
     power = np.mean(np.abs(np.fft.rfft(noise, axis=1)) ** 2, axis=(0, 2))
     slope = np.polyfit(np.log(np.arange(1, 512)), np.log(power[1:512]), 1)[0]
     assert slope == pytest.approx(-color, abs=0.05)
+    assert power[512] / power[511] == pytest.approx(1.0, abs=0.25)  # which has no complex conjugate

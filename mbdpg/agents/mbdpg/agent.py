@@ -79,7 +79,7 @@ class MBDPG:
         return state.actor, state.normalizer
 
     def exploration_std(self, state: State) -> Array:
-        """Spread of the Gaussian behavior policy pi."""
+        """Standard deviation of the behavior policy pi, its mean over episodes."""
         return state.std
 
     def fit(self, state: State, batch: Batch, *, key: PRNGKeyArray) -> tuple[State, Metrics]:

@@ -7,7 +7,7 @@ from typing import Literal
 
 from mbdpg.agents.objectives import RewardWeights
 from mbdpg.dynamics.fitting import Likelihood
-from mbdpg.interfaces import require_settings
+from mbdpg.interfaces import require, require_settings
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class Config:
     memory: int = 256
     """Width of the LSTM."""
     width: int = 256
-    """Width of each of the three dense layers of every network."""
+    """Width of each of the three dense layers of every network; rewards and ends have two of half as much."""
 
     def __post_init__(self) -> None:
         require_settings(
@@ -105,3 +105,5 @@ class Config:
             ),
             shares=("discount", "trace", "imagination_ratio", "target_update_rate", "exploration_scatter"),
         )
+        color = self.exploration_color
+        require(color <= 2.0, f"--exploration-color is {color}, expected a number from 0 (white) to 2 (red)")

@@ -19,6 +19,9 @@ from mbdpg.networks.policy import Policy
 DEPTHS = (1, 5, 10, 20)
 """Imagined steps after which the instruments look."""
 
+NEAR = 5
+"""Imagined steps whose rewards are compared with those that were paid."""
+
 OUTLYING = 5.0
 """An imagined observation entry beyond this many standard deviations counts as out of the data's range."""
 
@@ -37,11 +40,16 @@ def measure(config: Config, state: State, window: Window, realized_return: Float
     now = window.observation[:, config.burn_in]
     value = objectives.clipped_value(state.critics(now, window.action[:, config.burn_in])) * state.return_scale
     imagined = _imagine(state, state.actor, now, memory, depth=max(DEPTHS), printed=False)
+    few = slice(config.burn_in, config.burn_in + NEAR)
+    paid = window.reward[:, few] * state.scales.reward + window.terminal_reward[:, few] * state.scales.terminal_reward
+    exists = window.valid[:, few]
+    excess = jnp.sum((imagined.rewards[:NEAR].T - paid) * exists) / jnp.sum(exists)
     ended = jnp.max(window.terminated[:, config.burn_in :] * window.valid[:, config.burn_in :], axis=1)
     return (
         open_loop_error(state.dynamics, state.scales, window, burn_in=config.burn_in, depths=DEPTHS)
         | objectives.value_bias(value, realized_return)
         | {
+            "dynamics/reward_bias": excess * state.return_scale,
             "dynamics/survival_imagined": jnp.mean(imagined.survival()[-1]),
             "dynamics/survival_observed": 1.0 - jnp.mean(ended),
             "dynamics/out_of_range": jnp.mean(jnp.abs(imagined.observations[1:]) > OUTLYING),
