@@ -62,7 +62,7 @@ class Config:
     """Standard deviation of the behavior policy, its mean over episodes, while returns are a random policy's."""
     final_exploration_std: float = 0.1
     """The same once returns reach the reference return; in between it follows the return."""
-    exploration_color: float = 1.0
+    exploration_color: float = 0.0
     """Noise of the behavior policy has power 1/f^color: 0 is white, 1 pink, correlated over many steps."""
     exploration_scatter: float = 1.0
     """Every episode's spread is drawn uniformly from within this share of its mean, from none to twice as much at 1."""
