@@ -182,10 +182,13 @@ class Agent(Protocol):
         """The state with its scaling (and what follows from progress) set from the replay."""
 
     def policy(self, state: Any) -> tuple[Any, Any]:
-        """The deterministic policy and its observation normalizer."""
+        """What has been learned: the deterministic policy that is evaluated and saved, and its normalizer."""
 
-    def exploration_std(self, state: Any) -> Any:
-        """Standard deviation of the behavior policy, its mean over episodes, in units of the action range's half."""
+    def behavior(self, state: Any) -> tuple[Any, Any, Any]:
+        """What collects experience: a deterministic policy, its normalizer, and the noise's standard deviation.
+
+        The last is the mean over episodes, in units of half the action range.
+        """
 
     def diagnose(self, state: Any, batch: Batch, realized_return: Any) -> Metrics:
         """Instruments on evaluation episodes that learning has never seen; sampled as `diagnosis` says.

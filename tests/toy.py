@@ -64,8 +64,8 @@ class ToyAgent:
     def policy(self, state: ToyState) -> tuple[Policy, Normalizer]:
         return state.actor, state.normalizer
 
-    def exploration_std(self, state: ToyState) -> Any:
-        return jnp.full_like(state.log, 0.1)
+    def behavior(self, state: ToyState) -> tuple[Policy, Normalizer, Any]:
+        return *self.policy(state), jnp.full_like(state.log, 0.1)
 
     def update(self, state: ToyState, batch: Batch, *, key: Any) -> tuple[ToyState, Metrics]:
         seen = jnp.mean(batch.reward * batch.valid) + jax.random.normal(key, ())

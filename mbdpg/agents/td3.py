@@ -110,12 +110,12 @@ class TD3:
         return eqx.tree_at(lambda x: (x.normalizer, x.return_scale), state, (normalizer, statistics.return_scale))
 
     def policy(self, state: State) -> tuple[Policy, Normalizer]:
-        """The deterministic policy."""
+        """The actor."""
         return state.actor, state.normalizer
 
-    def exploration_std(self, state: State) -> Array:
-        """Constant."""
-        return jnp.full_like(state.return_scale, self.config.exploration_std)
+    def behavior(self, state: State) -> tuple[Policy, Normalizer, Array]:
+        """The actor, with constant noise."""
+        return state.actor, state.normalizer, jnp.full_like(state.return_scale, self.config.exploration_std)
 
     def update(self, state: State, batch: Batch, *, key: PRNGKeyArray) -> tuple[State, Metrics]:
         """One update from a batch of windows of one step."""

@@ -29,6 +29,7 @@ PAPER: dict[str, dict[str, Any]] = {
         "trace": 1.0,
         "target_update_rate": 1.0,
         "target_update_every": 3,
+        "average_share": 0.0,
         "exploration_color": 0.0,
         "exploration_scatter": 0.0,
         "random_steps": 4000,

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from mbdpg.interfaces import Agent, Batch, Metrics, Phase, Statistics, UserError
-from mbdpg.networks.policy import NumpyPolicy, policy_arrays
+from mbdpg.networks.normalizer import Normalizer
+from mbdpg.networks.policy import NumpyPolicy, Policy, policy_arrays
 
 
 class Learner:
@@ -23,7 +24,6 @@ class Learner:
         init_keys = jax.vmap(jax.random.fold_in, (0, None))(self._keys, 0)
         self.state = jax.jit(over_seeds(lambda key: agent.init(key=key)))(init_keys)
         self._prepare = jax.jit(over_seeds(agent.prepare))
-        self._std = jax.jit(jax.vmap(agent.exploration_std))
         self._diagnose = jax.jit(over_seeds(agent.diagnose))
         self._updates = {phase.name: _compile(phase) for phase in agent.phases}
 
@@ -46,14 +46,18 @@ class Learner:
         metrics = self._diagnose(self.state, _stack(batches), np.stack(realized))
         return {name: np.asarray(value) for name, value in metrics.items()}
 
-    def policies(self) -> list[dict[str, np.ndarray]]:
-        """Each seed's policy as named arrays."""
-        policy, normalizer = jax.device_get(self.agent.policy(self.state))
-        return [policy_arrays(*jax.tree.map(lambda x, i=i: x[i], (policy, normalizer))) for i in range(len(self._keys))]
+    def policies(self) -> list[NumpyPolicy]:
+        """Each seed's policy as learned."""
+        return self._on_host(*jax.vmap(self.agent.policy)(self.state))
 
-    def actors(self) -> tuple[list[NumpyPolicy], np.ndarray]:
-        """Each seed's policy for acting, and the standard deviations of the behavior policies."""
-        return [NumpyPolicy(arrays) for arrays in self.policies()], np.asarray(self._std(self.state))
+    def behaviors(self) -> tuple[list[NumpyPolicy], np.ndarray]:
+        """Each seed's policy for collecting, and the standard deviations of the noise."""
+        policy, normalizer, std = jax.vmap(self.agent.behavior)(self.state)
+        return self._on_host(policy, normalizer), np.asarray(std)
+
+    def _on_host(self, policy: Policy, normalizer: Normalizer) -> list[NumpyPolicy]:
+        pair = jax.device_get((policy, normalizer))
+        return [NumpyPolicy(policy_arrays(*jax.tree.map(lambda x, i=i: x[i], pair))) for i in range(len(self._keys))]
 
     def snapshot(self, index: int) -> dict[str, np.ndarray]:
         """One seed's whole state as named arrays."""

@@ -103,9 +103,9 @@ class Training:
         resumed run first takes the updates that are missing and goes on as if nothing had happened.
         """
         while self._learn(should_stop):
-            policies, stds = self.learner.actors()
+            policies, stds = self.learner.behaviors()
             if self._recorded < self.env_steps:
-                on_update(self._record(policies, stds))
+                on_update(self._record(stds))
             if self.env_steps >= self.schedule.steps or should_stop():
                 break
             self._collect(policies, stds)  # Algorithm 1, line 5
@@ -141,11 +141,11 @@ class Training:
         for collector, fact in zip(self.collectors, facts, strict=True):
             collector.restore(fact["collector"])
 
-    def _record(self, policies: Sequence[NumpyPolicy], stds: np.ndarray) -> Update:
+    def _record(self, stds: np.ndarray) -> Update:
         """Evaluate, log and save, each if it is due at this step."""
         schedule = self.schedule
         self._recorded = self.env_steps
-        evaluation = self._evaluate(policies) if self._due(schedule.evaluate_every) else None
+        evaluation = self._evaluate() if self._due(schedule.evaluate_every) else None
         if self._due(schedule.log_every):
             self._log(stds)
         if self._due(schedule.checkpoint_every):
@@ -196,9 +196,9 @@ class Training:
                 total, count = sums.get(name, (0.0, 0))
                 sums[name] = [total + float(values[index]), count + 1]
 
-    def _evaluate(self, policies: Sequence[NumpyPolicy]) -> list[Evaluation]:
+    def _evaluate(self) -> list[Evaluation]:
         began = time.monotonic()
-        evaluations = []
+        policies, evaluations = self.learner.policies(), []
         for collector, policy in zip(self.collectors, policies, strict=True):
             # The same episodes for every agent and at every evaluation: paired, so that differences are the policies'.
             seeds = [

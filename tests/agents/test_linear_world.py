@@ -70,9 +70,9 @@ def world(survival: float = 0.8) -> State:
     critics = eqx.tree_at(lambda x: x.mlps, critics, without_layers(critics.mlps, two))
     scales = Scales(jnp.asarray(DELTA, jnp.float32), jnp.float32(REWARD), jnp.float32(TERMINAL_REWARD))
     return eqx.tree_at(
-        lambda x: (x.dynamics, x.actor, x.critics, x.target_actor, x.target_critics, x.scales, x.beta),
+        lambda x: (x.dynamics, x.actor, x.average_actor, x.critics, x.target_actor, x.target_critics, x.scales, x.beta),
         state,
-        (linear_dynamics(rng, survival), actor, critics, actor, critics, scales, jnp.float32(0.6)),
+        (linear_dynamics(rng, survival), actor, actor, critics, actor, critics, scales, jnp.float32(0.6)),
     )
 
 

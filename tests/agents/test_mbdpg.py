@@ -29,6 +29,7 @@ PAPER = {
     "imagination_depth": 4,
     "target_update_every": 3,
     "target_update_rate": 0.25,
+    "average_share": 0.0,
 }
 """The other value of every switch."""
 MODES = pytest.mark.parametrize("settings", [(), tuple(PAPER.items())], ids=["default", "paper"])
@@ -63,7 +64,7 @@ def state() -> State:
         return jax.tree.map(lambda x: x + jnp.asarray(rng.normal(0, 0.2, x.shape), jnp.float32), network)
 
     def networks(x: State):
-        return x.dynamics, x.actor, x.critics, x.target_actor, x.target_critics
+        return x.dynamics, x.actor, x.average_actor, x.critics, x.target_actor, x.target_critics
 
     moved = eqx.tree_at(networks, fresh(), tuple(map(shaken, networks(fresh()))))
     return jax.jit(agent().prepare)(moved, statistics())
@@ -85,11 +86,12 @@ def batch(length: int, size: int = BATCH, seed: int = 0) -> Batch:
 
 
 BATCHES = {"fit": batch(BURN_IN + LENGTH), "clone": batch(1), "improve": batch(BURN_IN + 1)}
+TARGETS = {"target_actor", "target_critics"}
 MOVES = {
     "fit": {"dynamics", "dynamics_optimizer"},
-    "clone": {"actor", "critics", "target_actor", "target_critics", "actor_optimizer", "critic_optimizer"},
-    "improve": {"actor", "critics", "target_actor", "target_critics", "actor_optimizer", "critic_optimizer"},
+    "improve": {"actor", "average_actor", "critics", "actor_optimizer", "critic_optimizer", "updates", *TARGETS},
 }
+MOVES["clone"] = MOVES["improve"]
 
 
 def differences(before: Any, after: Any) -> set[str]:
@@ -120,7 +122,7 @@ def edited(original: Batch, **changes: tuple[Any, float]) -> Batch:
 @pytest.mark.parametrize("name", ["fit", "clone", "improve"])
 def test_an_update_moves_its_own_networks_and_nothing_else(name: str) -> None:
     after, metrics = update(name)(state(), BATCHES[name])
-    assert differences(state(), after) == MOVES[name] | ({"critic_steps"} if name != "fit" else set())
+    assert differences(state(), after) == MOVES[name]
     assert finite(after) and finite(metrics)
 
 
@@ -131,7 +133,7 @@ def test_the_papers_settings_move_the_same_and_fill_the_imagination_buffer() -> 
     assert finite(after) and finite(metrics)
     after, metrics = update("improve", settings)(state(), BATCHES["improve"])
     # The targets wait for the third update.
-    expected = {"actor", "critics", "actor_optimizer", "critic_optimizer", "critic_steps", "imagined"}
+    expected = MOVES["improve"] - TARGETS | {"imagined"}
     assert differences(state(), after) == expected
     assert finite(after) and finite(metrics)
 
@@ -145,9 +147,9 @@ def test_every_parameter_is_moved_by_its_update(name: str) -> None:
         assert (x != y).any(), jax.tree_util.keystr(path)
 
 
-def test_a_fresh_state_has_targets_equal_to_what_they_follow() -> None:
+def test_a_fresh_state_has_targets_and_average_equal_to_what_they_follow() -> None:
     fresh_state = fresh()
-    for online, target in (("actor", "target_actor"), ("critics", "target_critics")):
+    for online, target in (("actor", "target_actor"), ("actor", "average_actor"), ("critics", "target_critics")):
         pairs = zip(*(jax.tree.leaves(getattr(fresh_state, name)) for name in (online, target)), strict=True)
         assert all(np.array_equal(x, y) for x, y in pairs)
     assert finite(update("improve")(fresh_state, BATCHES["improve"])[0])
@@ -165,14 +167,26 @@ def test_targets_follow_at_their_rate_at_every_update() -> None:
             np.testing.assert_allclose(new, (1 - rate) * old + rate * followed, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize(("share", "updates", "rate"), [(0.0, 999, 1.0), (0.5, 5, 0.25), (0.01, 999, 1 / 11)])
+@pytest.mark.parametrize("name", ["clone", "improve"])
+def test_the_learned_policy_averages_the_actor_over_a_share_of_its_updates(
+    name: str, share: float, updates: int, rate: float
+) -> None:
+    before = eqx.tree_at(lambda x: x.updates, state(), jnp.int32(updates))
+    after, _ = update(name, (("average_share", share),))(before, BATCHES[name])
+    learned, normalizer = agent().policy(after)
+    assert normalizer is after.normalizer
+    for old, new, followed in zip(*map(jax.tree.leaves, (state().average_actor, learned, after.actor)), strict=True):
+        np.testing.assert_allclose(new, (1 - rate) * old + rate * followed, rtol=1e-5, atol=1e-6)
+
+
 def test_targets_wait_for_the_third_update_where_c_is_3() -> None:
     step = update("improve", tuple(PAPER.items()))
     states = [state()]
     for i in range(6):
         states.append(step(states[-1], BATCHES["improve"], i)[0])
-    moved = [{"target_actor", "target_critics"} & differences(a, b) for a, b in itertools.pairwise(states)]
-    both = {"target_actor", "target_critics"}
-    assert moved == [set(), set(), both, set(), set(), both]
+    moved = [TARGETS & differences(a, b) for a, b in itertools.pairwise(states)]
+    assert moved == [set(), set(), TARGETS, set(), set(), TARGETS]
     for old, new, followed in zip(
         *map(jax.tree.leaves, (states[2].target_critics, states[3].target_critics, states[3].critics)), strict=True
     ):
@@ -282,8 +296,9 @@ def test_beta_and_the_spread_of_exploration_follow_the_return(progress: float) -
     moving = MBDPG(Config(**NETWORKS, **SHAPES, beta=3.0, final_beta=1.0), ENV)
     prepared = jax.jit(moving.prepare)(state(), statistics(progress))
     assert float(prepared.beta) == pytest.approx(3 - 2 * progress)
-    assert float(moving.exploration_std(prepared)) == pytest.approx(0.3 - 0.2 * progress)
-    assert moving.policy(prepared)[0] is prepared.actor and moving.policy(prepared)[1] is prepared.normalizer
+    actor, normalizer, std = moving.behavior(prepared)
+    assert actor is prepared.actor and normalizer is prepared.normalizer
+    assert float(std) == pytest.approx(0.3 - 0.2 * progress)
     np.testing.assert_allclose(prepared.scales.delta, [0.2, 0.5, 0.5], rtol=1e-6)
     assert {"normalizer", "scales", "return_scale", "beta", "std"} >= differences(state(), prepared)
 

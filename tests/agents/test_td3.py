@@ -166,6 +166,7 @@ def test_the_instruments_compare_values_with_returns() -> None:
 
 
 def test_the_behavior_policy_is_the_actor_with_constant_noise() -> None:
-    assert float(agent().exploration_std(state())) == pytest.approx(0.1)
-    actor, normalizer = agent().policy(state())
+    actor, normalizer, std = agent().behavior(state())
     assert actor is state().actor and normalizer is state().normalizer
+    assert (actor, normalizer) == agent().policy(state())
+    assert float(std) == pytest.approx(0.1)

@@ -85,7 +85,7 @@ def test_each_of_several_seeds_learns_what_it_would_learn_alone_to_the_last_bit(
         assert same({name: value[1:] for name, value in found.items()}, expected)
     assert same(two.together.snapshot(1), two.alone.snapshot(0))
     assert not same(two.together.snapshot(0), two.together.snapshot(1))
-    assert same(two.together.policies()[1], two.alone.policies()[0])
+    assert same(two.together.policies()[1].arrays, two.alone.policies()[0].arrays)
     found, expected = diagnosed(two.together, [4, 9]), diagnosed(two.alone, [9])
     assert same({name: value[1:] for name, value in found.items()}, expected)
 
@@ -99,7 +99,7 @@ def test_every_array_of_a_state_is_in_its_snapshot_and_comes_back(two: Two) -> N
     assert not same(fresh.snapshot(0), taken[0])
     fresh.restore(taken)
     assert same(fresh.snapshot(0), taken[0]) and same(fresh.snapshot(1), taken[1])
-    assert same(fresh.policies()[1], two.together.policies()[1])
+    assert same(fresh.policies()[1].arrays, two.together.policies()[1].arrays)
 
 
 def test_a_learner_goes_on_bitwise_from_a_snapshot(two: Two) -> None:
@@ -151,7 +151,7 @@ def test_a_snapshot_of_another_width_is_refused_by_the_first_key_that_differs() 
 
 
 def test_the_policy_for_acting_is_the_state_s(two: Two) -> None:
-    policies, stds = two.together.actors()
+    policies, stds = two.together.behaviors()
     observation = np.array([0.3, -0.7], np.float32)
     actor, normalizer = two.together.agent.policy(jax.tree.map(lambda x: x[1], two.together.state))
     np.testing.assert_allclose(policies[1](observation), actor(normalizer(jax.numpy.asarray(observation))), atol=1e-6)
@@ -176,13 +176,13 @@ def test_nothing_is_compiled_after_the_first_round(toy: Any, compilations: list[
     learner = Learner(toy.ToyAgent(SPEC), [4, 9])
     learn(learner, [4, 9], range(1))
     diagnosed(learner, [4, 9])
-    learner.actors()
+    learner.behaviors()
     learner.snapshot(0)
     assert compilations
     compilations.clear()
     learn(learner, [4, 9], range(1, 6))
     diagnosed(learner, [4, 9])
-    learner.actors()
+    learner.behaviors()
     learner.snapshot(1)
     assert compilations == []
 

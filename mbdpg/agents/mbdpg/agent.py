@@ -75,12 +75,12 @@ class MBDPG:
         )
 
     def policy(self, state: State) -> tuple[Policy, Normalizer]:
-        """The deterministic policy mu."""
-        return state.actor, state.normalizer
+        """The running average of the actor: single updates may fell a robot that their average carries."""
+        return state.average_actor, state.normalizer
 
-    def exploration_std(self, state: State) -> Array:
-        """Standard deviation of the behavior policy pi, its mean over episodes."""
-        return state.std
+    def behavior(self, state: State) -> tuple[Policy, Normalizer, Array]:
+        """The actor mu itself, whose faults the replay must show, and the spread of pi around it."""
+        return state.actor, state.normalizer, state.std
 
     def fit(self, state: State, batch: Batch, *, key: PRNGKeyArray) -> tuple[State, Metrics]:
         """One update of the dynamics (Eq. 11)."""
@@ -186,11 +186,11 @@ class MBDPG:
         c = self.config
         updates, memory = self._optimizers.critic.update(gradient, state.critic_optimizer)
         critics = optax.apply_updates(state.critics, updates)
-        count = state.critic_steps + 1
+        count = state.updates + 1
         rate = jnp.where(jnp.mod(count, c.target_update_every) == 0, c.target_update_rate, 0.0)
         targets = optax.incremental_update((critics, state.actor), (state.target_critics, state.target_actor), rate)
         return eqx.tree_at(
-            lambda x: (x.critics, x.critic_optimizer, x.target_critics, x.target_actor, x.critic_steps),
+            lambda x: (x.critics, x.critic_optimizer, x.target_critics, x.target_actor, x.updates),
             state,
             (critics, memory, *targets, count),
         )
@@ -198,7 +198,9 @@ class MBDPG:
     def _step_actor(self, state: State, gradient: Policy) -> State:
         updates, memory = self._optimizers.actor.update(gradient, state.actor_optimizer)
         actor = optax.apply_updates(state.actor, updates)
-        return eqx.tree_at(lambda x: (x.actor, x.actor_optimizer), state, (actor, memory))
+        rate = 1.0 / (1.0 + self.config.average_share * state.updates.astype(jnp.float32))
+        average = optax.incremental_update(actor, state.average_actor, rate)
+        return eqx.tree_at(lambda x: (x.actor, x.average_actor, x.actor_optimizer), state, (actor, average, memory))
 
     def _start(self, state: State, window: Window, *, key: PRNGKeyArray) -> Start:
         """Where imagination starts: after each real transition, or for a share of them in the imagination buffer."""

@@ -56,6 +56,8 @@ class Config:
     """Share of the online networks that the targets take over at each of their updates (Polyak); 1 copies them."""
     target_update_every: int = 1
     """Actor and critic updates between two updates of the targets, the paper's C."""
+    average_share: float = 0.05
+    """The policy that is evaluated and saved averages the actor over about this share of all updates, the last ones."""
     target_noise: float = 0.2
     """Standard deviation of the noise on target actions."""
     exploration_std: float = 0.3
@@ -103,7 +105,14 @@ class Config:
                 *("actor_clip", "critic_clip", "target_update_every", "fit_length", "fit_batch_size", "fits_per_step"),
                 *("dynamics_learning_rate", "dynamics_clip", "gaussians", "memory", "width"),
             ),
-            shares=("discount", "trace", "imagination_ratio", "target_update_rate", "exploration_scatter"),
+            shares=(
+                "discount",
+                "trace",
+                "imagination_ratio",
+                "target_update_rate",
+                "average_share",
+                "exploration_scatter",
+            ),
         )
         color = self.exploration_color
         require(color <= 2.0, f"--exploration-color is {color}, expected a number from 0 (white) to 2 (red)")

@@ -24,6 +24,8 @@ class State(eqx.Module):
 
     dynamics: MixtureDynamics
     actor: Policy
+    average_actor: Policy
+    """Running average of the actor's parameters, whose newest terms weigh most."""
     critics: Critics
     target_actor: Policy
     target_critics: Critics
@@ -38,8 +40,8 @@ class State(eqx.Module):
     beta: Float[Array, ""]
     std: Float[Array, ""]
     """Of the behavior policy."""
-    critic_steps: Int[Array, ""]
-    """Critic updates so far."""
+    updates: Int[Array, ""]
+    """Of critics and actor, so far."""
 
 
 class Optimizers(NamedTuple):
@@ -66,7 +68,7 @@ def optimizers(config: Config) -> Optimizers:
 
 
 def initial_state(config: Config, env: EnvSpec, optimizers: Optimizers, *, key: PRNGKeyArray) -> State:
-    """Fresh networks; targets equal to what they follow."""
+    """Fresh networks; targets and average equal to what they follow."""
     o, a, widths = env.observation_size, env.action_size, (config.width,) * 3
     dynamics_key, actor_key, critic_key = jax.random.split(key, 3)
     dynamics = MixtureDynamics(o, a, gaussians=config.gaussians, memory=config.memory, widths=widths, key=dynamics_key)
@@ -76,6 +78,7 @@ def initial_state(config: Config, env: EnvSpec, optimizers: Optimizers, *, key: 
     return State(
         dynamics=dynamics,
         actor=actor,
+        average_actor=jax.tree.map(jnp.copy, actor),
         critics=critics,
         target_actor=jax.tree.map(jnp.copy, actor),
         target_critics=jax.tree.map(jnp.copy, critics),
@@ -88,5 +91,5 @@ def initial_state(config: Config, env: EnvSpec, optimizers: Optimizers, *, key: 
         imagined=ImaginationBuffer.empty(slots, o, dynamics.initial_memory((slots,))),
         beta=jnp.asarray(config.beta, jnp.float32),
         std=jnp.asarray(config.exploration_std, jnp.float32),
-        critic_steps=jnp.zeros((), jnp.int32),
+        updates=jnp.zeros((), jnp.int32),
     )
