@@ -100,15 +100,16 @@ def dynamics_loss(
 
     To the likelihood of the state and the squared error of the reward come the squared error of the mixture's mean
     (planning uses nothing else), the squared error of the terminal reward on terminal steps alone, and the cross
-    entropy of the continuation. Rewards and ends are learned between the real ends of a step, with the memory of the
-    imagined ones. Steps after an episode's end do not count.
+    entropy of the continuation. Rewards and ends are learned from what imagination will see of a step, so that they are
+    right on average there; they do not teach the state. Steps after an episode's end do not count.
     """
     lead = slice(0, burn_in)
     memory = warm_memory(dynamics, window.observation[:, lead], window.action[:, lead], window.valid[:, lead])
     future = jax.tree.map(lambda x: jnp.swapaxes(x[:, burn_in:], 0, 1), window)
     actions = jnp.swapaxes(future.action, 0, 1)
     prediction, imagined, memories = open_loop(dynamics, scales, future.observation[0], memory, actions)
-    outcome = dynamics.outcome(memories, future.observation, future.action, future.next_observation)
+    seen, mean, memories = jax.lax.stop_gradient((imagined[:-1], prediction.mean(), memories))
+    outcome = dynamics.outcome(memories, seen, future.action, mean)
     target = (future.next_observation - imagined[:-1]) / scales.delta.reshape(1, 1, -1)
     alive = future.valid * (1.0 - future.terminated)
     dead = future.valid * future.terminated

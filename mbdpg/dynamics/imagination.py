@@ -67,7 +67,7 @@ def imagine(
         prediction = dynamics.predict(memory, observation, action)
         delta = prediction.mean() if key is None else prediction.sample(key=jax.random.fold_in(key, t))
         after = next_observation(observation, delta, scales)
-        outcome = dynamics.outcome(memory, observation, action, after)
+        outcome = dynamics.outcome(memory, observation, action, delta)
         alive = jax.nn.sigmoid(outcome.continue_logit)
         reward = alive * outcome.reward * scales.reward
         reward += (1.0 - alive) * outcome.terminal_reward * scales.terminal_reward

@@ -141,16 +141,19 @@ class MixtureDynamics(eqx.Module):
         memory: Memory,
         observation: Float[Array, "*batch observation"],
         action: Float[Array, "*batch action"],
-        after: Float[Array, "*batch observation"],
+        delta: Float[Array, "*batch observation"],
     ) -> Outcome:
-        """Reward and end of the step to `after`, from the memory that has already seen observation and action.
+        """Reward and end of a step that changes the observation by `delta`.
 
-        Much of what looks like noise in a reward is noise of the next observation. A reward that is learned from both
-        ends of a step has less error that is the same at every step, which a value would sum (STEVE, Buckman et al.
-        2018, does so too).
+        Args:
+            memory: it has already seen this observation and action.
+            observation: before the step.
+            action: of the step.
+            delta: mean of the change, or a draw of it. Rewards often pay for a change (of speed, of place); between
+                two observations it would be a small difference of large numbers.
         """
         reward, terminal_reward, continue_logit = jnp.moveaxis(
-            self.outcome_network(jnp.concatenate([observation, action, after, memory.hidden], axis=-1)), -1, 0
+            self.outcome_network(jnp.concatenate([observation, action, delta, memory.hidden], axis=-1)), -1, 0
         )
         return Outcome(reward, terminal_reward, continue_logit)
 

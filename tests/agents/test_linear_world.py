@@ -70,16 +70,18 @@ def world(survival: float = 0.8) -> State:
     critics = eqx.tree_at(lambda x: x.mlps, critics, without_layers(critics.mlps, two))
     scales = Scales(jnp.asarray(DELTA, jnp.float32), jnp.float32(REWARD), jnp.float32(TERMINAL_REWARD))
     return eqx.tree_at(
-        lambda x: (x.dynamics, x.actor, x.average_actor, x.critics, x.target_actor, x.target_critics, x.scales, x.beta),
+        lambda x: (x.average_dynamics, x.actor, x.critics, x.target_actor, x.target_critics, x.scales, x.beta),
         state,
-        (linear_dynamics(rng, survival), actor, actor, critics, actor, critics, scales, jnp.float32(0.6)),
+        (linear_dynamics(rng, survival), actor, critics, actor, critics, scales, jnp.float32(0.6)),
     )
 
 
 def mortal_world() -> State:
-    """The same, but that survival depends on both ends of a step and on the action."""
+    """The same, but that survival depends on the state, the action and the change."""
     return eqx.tree_at(
-        lambda x: x.dynamics.outcome_network.output.weight, world(), replace_fn=lambda w: w.at[: 2 * O + A, -1].set(0.7)
+        lambda x: x.average_dynamics.outcome_network.output.weight,
+        world(),
+        replace_fn=lambda w: w.at[: 2 * O + A, -1].set(0.7),
     )
 
 
@@ -91,8 +93,8 @@ def in_numpy(dynamics: MixtureDynamics) -> tuple[np.ndarray, ...]:
     d = np.einsum("m,imo->oi", ALPHA, means) * DELTA[:, None]
     head = dynamics.outcome_network.output
     weight, bias = np.asarray(head.weight, np.float64), np.asarray(head.bias, np.float64)
-    now, after = np.concatenate([weight[: O + A], bias[None]]), weight[O + A : O + A + O]
-    rewards = now + (np.eye(O, O + A + 1) + d).T @ after  # s' = s + d [s a 1]
+    now, change = np.concatenate([weight[: O + A], bias[None]]), weight[O + A : O + A + O]
+    rewards = now + (d / DELTA[:, None]).T @ change
     return d, rewards[:, 0] * REWARD, rewards[:, 1] * TERMINAL_REWARD
 
 
@@ -115,11 +117,11 @@ def policy_gradient(state: State, start: Start, **settings) -> tuple[Policy, dic
 
 def hand_written_eq_19(state: State, start: Start, horizon: int, first_value: int, weights: list[float]) -> np.ndarray:
     """Eqs. 19 and 20, one sample and one step at a time; parameters in the order of W (O x A), then b (A)."""
-    d, w, v = in_numpy(state.dynamics)
+    d, w, v = in_numpy(state.average_dynamics)
     weight, bias = (np.asarray(x, np.float64) for x in (state.actor.mlp.output.weight, state.actor.mlp.output.bias))
     mlps = state.critics.mlps.output
     q = np.concatenate([np.asarray(mlps.weight, np.float64)[..., 0], np.asarray(mlps.bias, np.float64)], axis=1)
-    survival, beta = float(jax.nn.sigmoid(state.dynamics.outcome_network.output.bias[-1])), float(state.beta)
+    survival, beta = float(jax.nn.sigmoid(state.average_dynamics.outcome_network.output.bias[-1])), float(state.beta)
     reward = survival * w + (1 - survival) * v
     total = np.zeros((O + 1) * A)
     for s in np.asarray(start.observation, np.float64):
@@ -159,7 +161,7 @@ def test_the_eq19_gradient_is_the_hand_written_recursion(first_value: int, rewar
 
 def test_both_critics_decide_in_the_eq19_test() -> None:
     state, start = world(), start_states()
-    imagined = imagine(state.dynamics, state.scales, state.actor, start.observation, start.memory, horizon=3)
+    imagined = imagine(state.average_dynamics, state.scales, state.actor, start.observation, start.memory, horizon=3)
     which = jnp.argmin(state.critics(imagined.observations, imagined.actions), axis=0)
     assert 0 < jnp.mean(which.astype(jnp.float32)) < 1
 
@@ -168,7 +170,7 @@ def test_without_rewards_the_eq19_gradient_is_that_of_ordinary_dpg() -> None:
     state, start = eqx.tree_at(lambda x: x.beta, mortal_world(), jnp.zeros(())), start_states()
     gradient, metrics = policy_gradient(state, start, gradient="eq19", horizon=1, first_value=0)
     assert abs(metrics["actor/objective"]) < 1  # so the loss is not divided by its size
-    after = imagine(state.dynamics, state.scales, state.actor, start.observation, start.memory, horizon=1)
+    after = imagine(state.average_dynamics, state.scales, state.actor, start.observation, start.memory, horizon=1)
 
     def deterministic_policy_gradient(actor: Policy) -> jax.Array:
         total = jnp.zeros(())
@@ -221,7 +223,7 @@ def test_the_actors_loss_is_scaled_by_the_objectives_size_without_a_gradient_thr
 
 def exact(state: State) -> State:
     """Policy constant, survival certain, both critics (and targets) equal to the true Q of this world."""
-    d, w, _ = in_numpy(state.dynamics)
+    d, w, _ = in_numpy(state.average_dynamics)
     action = np.tanh(np.asarray(state.actor.mlp.output.bias, np.float64))
     # V(s) = v s + c with a constant action: v = w_s + gamma (I + d_s)' v.
     v = np.linalg.solve(np.eye(O) - GAMMA * (np.eye(O) + d[:, :O]).T, w[:O])
@@ -255,7 +257,7 @@ def test_exact_critics_are_a_fixed_point(trace: float, imagination_ratio: float)
         ),
         ENV,
     )
-    d, w, _ = in_numpy(state.dynamics)
+    d, w, _ = in_numpy(state.average_dynamics)
     rng = np.random.default_rng(2)
     s, a = rng.normal(size=(BATCH, 1, O)), rng.uniform(-1, 1, (BATCH, 1, A))
     x = np.concatenate([s, a, np.ones((BATCH, 1, 1))], axis=-1)

@@ -64,7 +64,7 @@ def state() -> State:
         return jax.tree.map(lambda x: x + jnp.asarray(rng.normal(0, 0.2, x.shape), jnp.float32), network)
 
     def networks(x: State):
-        return x.dynamics, x.actor, x.average_actor, x.critics, x.target_actor, x.target_critics
+        return tuple(getattr(x, name) for name in NETWORKS_OF_A_STATE)
 
     moved = eqx.tree_at(networks, fresh(), tuple(map(shaken, networks(fresh()))))
     return jax.jit(agent().prepare)(moved, statistics())
@@ -87,8 +87,9 @@ def batch(length: int, size: int = BATCH, seed: int = 0) -> Batch:
 
 BATCHES = {"fit": batch(BURN_IN + LENGTH), "clone": batch(1), "improve": batch(BURN_IN + 1)}
 TARGETS = {"target_actor", "target_critics"}
+NETWORKS_OF_A_STATE = ("dynamics", "average_dynamics", "actor", "average_actor", "critics", *sorted(TARGETS))
 MOVES = {
-    "fit": {"dynamics", "dynamics_optimizer"},
+    "fit": {"dynamics", "average_dynamics", "dynamics_optimizer", "fits"},
     "improve": {"actor", "average_actor", "critics", "actor_optimizer", "critic_optimizer", "updates", *TARGETS},
 }
 MOVES["clone"] = MOVES["improve"]
@@ -147,9 +148,10 @@ def test_every_parameter_is_moved_by_its_update(name: str) -> None:
         assert (x != y).any(), jax.tree_util.keystr(path)
 
 
-def test_a_fresh_state_has_targets_and_average_equal_to_what_they_follow() -> None:
+def test_a_fresh_state_has_targets_and_averages_equal_to_what_they_follow() -> None:
     fresh_state = fresh()
-    for online, target in (("actor", "target_actor"), ("actor", "average_actor"), ("critics", "target_critics")):
+    for target in ("target_actor", "target_critics", "average_actor", "average_dynamics"):
+        online = target.partition("_")[2]
         pairs = zip(*(jax.tree.leaves(getattr(fresh_state, name)) for name in (online, target)), strict=True)
         assert all(np.array_equal(x, y) for x, y in pairs)
     assert finite(update("improve")(fresh_state, BATCHES["improve"])[0])
@@ -167,17 +169,28 @@ def test_targets_follow_at_their_rate_at_every_update() -> None:
             np.testing.assert_allclose(new, (1 - rate) * old + rate * followed, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize(("share", "updates", "rate"), [(0.0, 999, 1.0), (0.5, 5, 0.25), (0.01, 999, 1 / 11)])
-@pytest.mark.parametrize("name", ["clone", "improve"])
-def test_the_learned_policy_averages_the_actor_over_a_share_of_its_updates(
-    name: str, share: float, updates: int, rate: float
-) -> None:
-    before = eqx.tree_at(lambda x: x.updates, state(), jnp.int32(updates))
+@pytest.mark.parametrize(("share", "updates", "rate"), [(0.0, 999, 1.0), (0.5, 6, 0.25), (0.01, 1000, 1 / 11)])
+@pytest.mark.parametrize("name", ["fit", "clone", "improve"])
+def test_averages_reach_back_over_a_share_of_the_updates(name: str, share: float, updates: int, rate: float) -> None:
+    # Critics and targets are stepped, and counted, before the actor.
+    counts = (updates, updates - 1)
+    before = eqx.tree_at(lambda x: (x.fits, x.updates), state(), tuple(map(jnp.int32, counts)))
     after, _ = update(name, (("average_share", share),))(before, BATCHES[name])
-    learned, normalizer = agent().policy(after)
-    assert normalizer is after.normalizer
-    for old, new, followed in zip(*map(jax.tree.leaves, (state().average_actor, learned, after.actor)), strict=True):
+    network = "dynamics" if name == "fit" else "actor"
+    trees = (getattr(before, f"average_{network}"), getattr(after, f"average_{network}"), getattr(after, network))
+    for old, new, followed in zip(*map(jax.tree.leaves, trees), strict=True):
         np.testing.assert_allclose(new, (1 - rate) * old + rate * followed, rtol=1e-5, atol=1e-6)
+
+
+def test_the_average_is_what_imagines_and_what_is_evaluated() -> None:
+    learned, normalizer = agent().policy(state())
+    assert learned is state().average_actor and normalizer is state().normalizer
+    newest = eqx.tree_at(lambda x: x.dynamics, state(), fresh().dynamics)
+    average = eqx.tree_at(lambda x: x.average_dynamics, state(), fresh().dynamics)
+    expected = update("improve")(state(), BATCHES["improve"])[0].actor
+    for changed, same in ((newest, True), (average, False)):
+        found = update("improve")(changed, BATCHES["improve"])[0].actor
+        assert (not differences(expected, found)) == same
 
 
 def test_targets_wait_for_the_third_update_where_c_is_3() -> None:

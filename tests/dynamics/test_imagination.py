@@ -40,7 +40,7 @@ def test_imagination_is_a_python_loop(horizon: int) -> None:
         memory = DYNAMICS.remember(memory, observation, action)
         p = DYNAMICS.predict(memory, observation, action)
         after = next_observation(observation, p.mean(), SCALES)
-        outcome = DYNAMICS.outcome(memory, observation, action, after)
+        outcome = DYNAMICS.outcome(memory, observation, action, p.mean())
         lives = 1 / (1 + np.exp(-np.asarray(outcome.continue_logit)))
         reward = lives * np.asarray(outcome.reward) * 0.7 + (1 - lives) * np.asarray(outcome.terminal_reward) * 3.0
         np.testing.assert_allclose(imagined.continues[t], lives, atol=1e-4)

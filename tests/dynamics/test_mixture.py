@@ -170,10 +170,10 @@ def test_a_fresh_model_expects_to_live_on(dynamics: MixtureDynamics) -> None:
     assert 0.9 < float(jnp.mean(jax.nn.sigmoid(outcome.continue_logit))) < 0.999
 
 
-@pytest.mark.parametrize("read", ["observation", "action", "after", "memory"])
-def test_an_outcome_depends_on_both_ends_of_the_step_and_on_the_memory(dynamics: MixtureDynamics, read: str) -> None:
+@pytest.mark.parametrize("read", ["observation", "action", "delta", "memory"])
+def test_an_outcome_depends_on_the_step_its_change_and_the_memory(dynamics: MixtureDynamics, read: str) -> None:
     observation, action = pair(np.random.default_rng(9), BATCH)
-    step = {"observation": observation, "action": action, "after": observation + 1}
+    step = {"observation": observation, "action": action, "delta": observation + 1}
     step["memory"] = Memory(jnp.ones((BATCH, MEMORY)), jnp.ones((BATCH, MEMORY)))
     moved = step | {read: jax.tree.map(lambda x: x + 0.5, step[read])}
     for before, after in zip(dynamics.outcome(**step), dynamics.outcome(**moved), strict=True):

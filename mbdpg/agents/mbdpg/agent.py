@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -97,7 +97,13 @@ class MBDPG:
         updates, memory = self._optimizers.dynamics.update(gradient, state.dynamics_optimizer)
         dynamics = optax.apply_updates(state.dynamics, updates)
         metrics |= {"dynamics/grad_norm": optax.tree.norm(gradient), "dynamics/skipped": memory.total_notfinite}
-        return eqx.tree_at(lambda x: (x.dynamics, x.dynamics_optimizer), state, (dynamics, memory)), metrics
+        average = self._average(state.average_dynamics, dynamics, state.fits)
+        state = eqx.tree_at(
+            lambda x: (x.dynamics, x.average_dynamics, x.dynamics_optimizer, x.fits),
+            state,
+            (dynamics, average, memory, state.fits + 1),
+        )
+        return state, metrics
 
     def clone(self, state: State, batch: Batch, *, key: PRNGKeyArray) -> tuple[State, Metrics]:
         """Learn critics (Eq. 14) and actor (Eq. 15) from a batch of demonstrated transitions."""
@@ -198,13 +204,18 @@ class MBDPG:
     def _step_actor(self, state: State, gradient: Policy) -> State:
         updates, memory = self._optimizers.actor.update(gradient, state.actor_optimizer)
         actor = optax.apply_updates(state.actor, updates)
-        rate = 1.0 / (1.0 + self.config.average_share * state.updates.astype(jnp.float32))
-        average = optax.incremental_update(actor, state.average_actor, rate)
+        average = self._average(state.average_actor, actor, state.updates)
         return eqx.tree_at(lambda x: (x.actor, x.average_actor, x.actor_optimizer), state, (actor, average, memory))
+
+    def _average(self, average: Any, newest: Any, count: Array) -> Any:
+        """Take over so much of the newest that the average reaches back over `average_share` of `count` updates."""
+        return optax.incremental_update(
+            newest, average, 1.0 / (1.0 + self.config.average_share * count.astype(jnp.float32))
+        )
 
     def _start(self, state: State, window: Window, *, key: PRNGKeyArray) -> Start:
         """Where imagination starts: after each real transition, or for a share of them in the imagination buffer."""
-        memory = warm_memory(state.dynamics, window.observation, window.action, window.valid)
+        memory = warm_memory(state.average_dynamics, window.observation, window.action, window.valid)
         memory = jax.lax.stop_gradient(memory)
         alive = 1.0 - window.terminated[:, -1]
         real = Start(window.next_observation[:, -1], memory, alive, jnp.zeros_like(alive))
@@ -222,7 +233,7 @@ class MBDPG:
         c = self.config
         printed = c.gradient == "eq19"
         imagined = imagine(
-            state.dynamics,
+            state.average_dynamics,
             state.scales,
             actor,
             start.observation,

@@ -36,7 +36,9 @@ def measure(config: Config, state: State, window: Window, realized_return: Float
         realized_return: discounted return that followed the first step after the burn-in, NaN where unknown.
     """
     past = slice(0, config.burn_in)
-    memory = warm_memory(state.dynamics, window.observation[:, past], window.action[:, past], window.valid[:, past])
+    memory = warm_memory(
+        state.average_dynamics, window.observation[:, past], window.action[:, past], window.valid[:, past]
+    )
     now = window.observation[:, config.burn_in]
     value = objectives.clipped_value(state.critics(now, window.action[:, config.burn_in])) * state.return_scale
     imagined = _imagine(state, state.actor, now, memory, depth=max(DEPTHS), printed=False)
@@ -46,7 +48,7 @@ def measure(config: Config, state: State, window: Window, realized_return: Float
     excess = jnp.sum((imagined.rewards[:NEAR].T - paid) * exists) / jnp.sum(exists)
     ended = jnp.max(window.terminated[:, config.burn_in :] * window.valid[:, config.burn_in :], axis=1)
     return (
-        open_loop_error(state.dynamics, state.scales, window, burn_in=config.burn_in, depths=DEPTHS)
+        open_loop_error(state.average_dynamics, state.scales, window, burn_in=config.burn_in, depths=DEPTHS)
         | objectives.value_bias(value, realized_return)
         | {
             "dynamics/reward_bias": excess * state.return_scale,
@@ -76,4 +78,6 @@ def _gradient_norm(config: Config, state: State, start: Array, memory: Memory, d
 
 
 def _imagine(state: State, actor: Policy, start: Array, memory: Memory, *, depth: int, printed: bool) -> Trajectory:
-    return imagine(state.dynamics, state.scales, actor, start, memory, horizon=depth, detach_policy_input=printed)
+    return imagine(
+        state.average_dynamics, state.scales, actor, start, memory, horizon=depth, detach_policy_input=printed
+    )

@@ -23,9 +23,11 @@ class State(eqx.Module):
     """Everything that learning changes."""
 
     dynamics: MixtureDynamics
+    average_dynamics: MixtureDynamics
+    """Running average of the dynamics' parameters, whose newest terms weigh most: what imagines."""
     actor: Policy
     average_actor: Policy
-    """Running average of the actor's parameters, whose newest terms weigh most."""
+    """The same of the actor's: what is evaluated and saved."""
     critics: Critics
     target_actor: Policy
     target_critics: Critics
@@ -40,8 +42,10 @@ class State(eqx.Module):
     beta: Float[Array, ""]
     std: Float[Array, ""]
     """Of the behavior policy."""
+    fits: Int[Array, ""]
+    """Updates of the dynamics so far."""
     updates: Int[Array, ""]
-    """Of critics and actor, so far."""
+    """Updates of critics and actor so far."""
 
 
 class Optimizers(NamedTuple):
@@ -68,7 +72,7 @@ def optimizers(config: Config) -> Optimizers:
 
 
 def initial_state(config: Config, env: EnvSpec, optimizers: Optimizers, *, key: PRNGKeyArray) -> State:
-    """Fresh networks; targets and average equal to what they follow."""
+    """Fresh networks; targets and averages equal to what they follow."""
     o, a, widths = env.observation_size, env.action_size, (config.width,) * 3
     dynamics_key, actor_key, critic_key = jax.random.split(key, 3)
     dynamics = MixtureDynamics(o, a, gaussians=config.gaussians, memory=config.memory, widths=widths, key=dynamics_key)
@@ -77,6 +81,7 @@ def initial_state(config: Config, env: EnvSpec, optimizers: Optimizers, *, key: 
     one, slots = jnp.ones(()), 8 * config.batch_size
     return State(
         dynamics=dynamics,
+        average_dynamics=jax.tree.map(jnp.copy, dynamics),
         actor=actor,
         average_actor=jax.tree.map(jnp.copy, actor),
         critics=critics,
@@ -91,5 +96,6 @@ def initial_state(config: Config, env: EnvSpec, optimizers: Optimizers, *, key: 
         imagined=ImaginationBuffer.empty(slots, o, dynamics.initial_memory((slots,))),
         beta=jnp.asarray(config.beta, jnp.float32),
         std=jnp.asarray(config.exploration_std, jnp.float32),
+        fits=jnp.zeros((), jnp.int32),
         updates=jnp.zeros((), jnp.int32),
     )
