@@ -69,11 +69,10 @@ def world(survival: float = 0.8) -> State:
     two = jax.tree.map(lambda *x: jnp.stack(x), *(affine(rng, O + A, 1, 0.5) for _ in range(2)))
     critics = eqx.tree_at(lambda x: x.mlps, critics, without_layers(critics.mlps, two))
     scales = Scales(jnp.asarray(DELTA, jnp.float32), jnp.float32(REWARD), jnp.float32(TERMINAL_REWARD))
-    return eqx.tree_at(
-        lambda x: (x.average_dynamics, x.actor, x.critics, x.target_actor, x.target_critics, x.scales, x.beta),
-        state,
-        (linear_dynamics(rng, survival), actor, critics, actor, critics, scales, jnp.float32(0.6)),
-    )
+    parts = {"average_dynamics": linear_dynamics(rng, survival), "scales": scales, "beta": jnp.float32(0.6)}
+    parts |= dict.fromkeys(("actor", "target_actor", "average_actor"), actor)
+    parts |= dict.fromkeys(("critics", "target_critics"), critics)
+    return eqx.tree_at(lambda x: [getattr(x, name) for name in parts], state, list(parts.values()))
 
 
 def mortal_world() -> State:

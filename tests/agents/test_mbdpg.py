@@ -211,7 +211,7 @@ def test_targets_wait_for_the_third_update_where_c_is_3() -> None:
 def test_a_batch_that_is_not_finite_moves_nothing_and_is_counted(settings: tuple, poison: float) -> None:
     bad = edited(BATCHES["fit"], reward=((0, BURN_IN), poison))
     after, metrics = update("fit", settings)(state(), bad)
-    assert differences(state(), after) == {"dynamics_optimizer"}
+    assert differences(state(), after) == MOVES["fit"] - {"dynamics"}  # the average nears what is there already
     assert metrics["dynamics/skipped"] == 1
     # Infinite observations are clipped by the normalizer: nothing to skip. NaN reaches both, a reward the critics.
     bad = edited(BATCHES["improve"], reward=((0, -1), poison), next_observation=((1, -1), np.nan))
