@@ -100,17 +100,19 @@ def dynamics_loss(
 
     To the likelihood of the state and the squared error of the reward come the squared error of the mixture's mean
     (planning uses nothing else), the squared error of the terminal reward on terminal steps alone, and the cross
-    entropy of the continuation. Rewards and ends are learned from what imagination will see of a step, so that they are
-    right on average there; they do not teach the state. Steps after an episode's end do not count.
+    entropy of the continuation. Rewards and ends are learned between the real ends of a step, with the memory of the
+    imagined ones: learned between imagined ends, the reward for a leg that touches the ground is paid at every step in
+    which it may have touched. Steps after an episode's end do not count.
     """
     lead = slice(0, burn_in)
     memory = warm_memory(dynamics, window.observation[:, lead], window.action[:, lead], window.valid[:, lead])
     future = jax.tree.map(lambda x: jnp.swapaxes(x[:, burn_in:], 0, 1), window)
     actions = jnp.swapaxes(future.action, 0, 1)
     prediction, imagined, memories = open_loop(dynamics, scales, future.observation[0], memory, actions)
-    seen, mean, memories = jax.lax.stop_gradient((imagined[:-1], prediction.mean(), memories))
-    outcome = dynamics.outcome(memories, seen, future.action, mean)
-    target = (future.next_observation - imagined[:-1]) / scales.delta.reshape(1, 1, -1)
+    unit = scales.delta.reshape(1, 1, -1)
+    change = (future.next_observation - future.observation) / unit
+    outcome = dynamics.outcome(memories, future.observation, future.action, change)
+    target = (future.next_observation - imagined[:-1]) / unit
     alive = future.valid * (1.0 - future.terminated)
     dead = future.valid * future.terminated
     count = jnp.maximum(jnp.sum(future.valid), 1.0)
