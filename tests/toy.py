@@ -36,6 +36,7 @@ class ToyConfig:
 
 class ToyState(NamedTuple):
     actor: Policy
+    """What is learned; the behavior is its negative."""
     normalizer: Normalizer
     log: Any
     """A number that depends on every batch and key, and on their order."""
@@ -65,7 +66,7 @@ class ToyAgent:
         return state.actor, state.normalizer
 
     def behavior(self, state: ToyState) -> tuple[Policy, Normalizer, Any]:
-        return *self.policy(state), jnp.full_like(state.log, 0.1)
+        return jax.tree.map(jnp.negative, state.actor), state.normalizer, jnp.full_like(state.log, 0.1)
 
     def update(self, state: ToyState, batch: Batch, *, key: Any) -> tuple[ToyState, Metrics]:
         seen = jnp.mean(batch.reward * batch.valid) + jax.random.normal(key, ())
@@ -117,6 +118,7 @@ class ToyRecorder:
     def __init__(self) -> None:
         self.rows: list[dict[str, Any]] = []
         self.policies: list[tuple[int, float]] = []
+        self.saved: dict[str, np.ndarray] = {}
         self.checkpoints: list[tuple[int, dict[str, np.ndarray], dict[str, Any], dict[str, np.ndarray]]] = []
 
     def write(self, kind: str, env_steps: int, values: Metrics) -> None:
@@ -125,6 +127,7 @@ class ToyRecorder:
 
     def save_policy(self, arrays: dict[str, np.ndarray], env_steps: int, return_mean: float) -> None:
         self.policies.append((env_steps, return_mean))
+        self.saved = arrays
 
     def save_checkpoint(
         self, env_steps: int, arrays: dict[str, np.ndarray], facts: dict[str, Any], replay: dict[str, np.ndarray]

@@ -85,6 +85,17 @@ def imagine(
     )
 
 
+class Start(NamedTuple):
+    """Where imagination begins."""
+
+    observation: Float[Array, "batch observation"]
+    memory: Memory
+    weight: Float[Array, " batch"]
+    """Probability that the episode goes on here."""
+    depth: Float[Array, " batch"]
+    """Imagined steps since a real state; 0 at a real one."""
+
+
 class ImaginationBuffer(NamedTuple):
     """D_model of Algorithm 1: imagined states from which further imagination may start; a ring."""
 
@@ -115,9 +126,9 @@ class ImaginationBuffer(NamedTuple):
 
         return jax.tree.map(write, self, new)._replace(added=self.added + batch)
 
-    def sample(self, batch: int, *, key: PRNGKeyArray) -> tuple[Array, Memory, Array, Array]:
-        """Observations, memories, weights and depths of states drawn uniformly; weight 0 while there are none."""
+    def sample(self, batch: int, *, key: PRNGKeyArray) -> Start:
+        """States drawn uniformly; weight 0 while there are none."""
         filled = jnp.minimum(self.added, self.weight.shape[0]).astype(jnp.float32)
         rows = (jax.random.uniform(key, (batch,)) * filled).astype(jnp.int32)
         memory = Memory(self.memory.hidden[rows], self.memory.cell[rows])
-        return self.observation[rows], memory, self.weight[rows], self.depth[rows]
+        return Start(self.observation[rows], memory, self.weight[rows], self.depth[rows])

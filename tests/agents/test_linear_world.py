@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 
 from mbdpg.agents.mbdpg import MBDPG, Config, State
-from mbdpg.agents.mbdpg.agent import Start
 from mbdpg.agents.mbdpg.state import optimizers
-from mbdpg.dynamics.imagination import imagine
+from mbdpg.dynamics.imagination import Start, imagine
 from mbdpg.dynamics.mixture import Memory, MixtureDynamics, Scales
 from mbdpg.interfaces import Batch, EnvSpec
 from mbdpg.networks.critic import Critics

@@ -128,8 +128,9 @@ def test_the_loss_is_numpys_sum_over_steps(dynamics: MixtureDynamics) -> None:
     observation, action, valid = (jnp.asarray(x) for x in (w.observation, w.action, w.valid))
     memory = warm_memory(dynamics, observation[:, :BURN_IN], action[:, :BURN_IN], valid[:, :BURN_IN])
     p, reached, memories = open_loop(dynamics, SCALES, observation[:, BURN_IN], memory, action[:, BURN_IN:])
-    before, taken, after = (np.swapaxes(x[:, BURN_IN:], 0, 1) for x in (w.observation, w.action, w.next_observation))
-    outcome = dynamics.outcome(memories, before, taken, (after - before) / np.asarray(SCALES.delta))
+    steps = (w.observation, w.action, w.next_observation)
+    before, taken, after = (jnp.swapaxes(jnp.asarray(x[:, BURN_IN:]), 0, 1) for x in steps)
+    outcome = dynamics.outcome(memories, before, taken, (after - before) / SCALES.delta.reshape(1, 1, -1))
     parts = dict.fromkeys(("nll", "mean_mse", "reward_mse", "terminal", "continue_bce"), 0.0)
     for i in range(BATCH):
         for t in range(LENGTH):

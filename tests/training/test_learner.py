@@ -150,11 +150,14 @@ def test_a_snapshot_of_another_width_is_refused_by_the_first_key_that_differs() 
     assert f": {first} is float32[2, 4], expected float32[2, 8]" in str(caught.value)
 
 
-def test_the_policy_for_acting_is_the_state_s(two: Two) -> None:
+def test_policies_on_the_host_are_the_state_s(two: Two) -> None:
     policies, stds = two.together.behaviors()
     observation = np.array([0.3, -0.7], np.float32)
-    actor, normalizer = two.together.agent.policy(jax.tree.map(lambda x: x[1], two.together.state))
-    np.testing.assert_allclose(policies[1](observation), actor(normalizer(jax.numpy.asarray(observation))), atol=1e-6)
+    one = jax.tree.map(lambda x: x[1], two.together.state)
+    chosen = (policies, two.together.agent.behavior(one)), (two.together.policies(), two.together.agent.policy(one))
+    for found, (policy, normalizer, *_) in chosen:
+        expected = policy(normalizer(jax.numpy.asarray(observation)))
+        np.testing.assert_allclose(found[1](observation), expected, atol=1e-6)
     assert stds.shape == (2,) and (stds >= 0).all()
 
 

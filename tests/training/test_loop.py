@@ -83,6 +83,20 @@ def test_a_row_has_the_means_since_the_row_before(whole: Any) -> None:
     assert found[20]["critic/loss"] != found[30]["critic/loss"]
 
 
+def test_what_is_learned_is_evaluated_and_saved_and_the_behavior_collects(whole: Any) -> None:
+    training, recorders, updates = whole
+    learned, (behaviors, _) = training.learner.policies()[1], training.learner.behaviors()
+    assert bytes_of(recorders[1].saved) == bytes_of(learned.arrays)
+    played = updates[-1].evaluation[1].steps.columns()
+    for observation, action in zip(played["observation"], played["action"], strict=True):
+        np.testing.assert_array_equal(action, learned(observation))
+    assert not np.allclose(learned(played["observation"][0]), behaviors[1](played["observation"][0]), atol=0.01)
+    # Noise has a spread of 0.1, and the two policies are further apart.
+    last = training.collectors[1].replay.columns()
+    pairs = zip(last["observation"][-5:], last["action"][-5:], strict=True)
+    assert np.mean([abs(action - behaviors[1](observation)) for observation, action in pairs]) < 0.2
+
+
 def starts(evaluation: Evaluation) -> tuple[float, ...]:
     columns = evaluation.steps.columns()
     first = columns["start"] == np.arange(evaluation.steps.size)

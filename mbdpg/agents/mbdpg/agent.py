@@ -2,36 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, PRNGKeyArray
 
 from mbdpg.agents import objectives
 from mbdpg.agents.mbdpg import instruments
 from mbdpg.agents.mbdpg.config import Config
 from mbdpg.agents.mbdpg.state import State, initial_state, optimizers
 from mbdpg.dynamics.fitting import Window, dynamics_loss, warm_memory
-from mbdpg.dynamics.imagination import ImaginationBuffer, Trajectory, imagine
-from mbdpg.dynamics.mixture import Memory, Scales
+from mbdpg.dynamics.imagination import ImaginationBuffer, Start, Trajectory, imagine
+from mbdpg.dynamics.mixture import Scales
 from mbdpg.interfaces import Batch, EnvSpec, Metrics, Phase, Sampling, Statistics
 from mbdpg.networks.critic import Critics
 from mbdpg.networks.normalizer import Normalizer
 from mbdpg.networks.policy import Policy
-
-
-class Start(NamedTuple):
-    """Where imagination begins."""
-
-    observation: Float[Array, "batch observation"]
-    memory: Memory
-    weight: Float[Array, " batch"]
-    """Probability that the episode goes on here."""
-    depth: Float[Array, " batch"]
-    """Imagined steps since a real state; 0 where it is the state after the batch's own transition."""
 
 
 class MBDPG:
@@ -75,11 +64,11 @@ class MBDPG:
         )
 
     def policy(self, state: State) -> tuple[Policy, Normalizer]:
-        """The running average of the actor: single updates may fell a robot that their average carries."""
+        """The running average of the actor, which wanders less than the actor does from update to update."""
         return state.average_actor, state.normalizer
 
     def behavior(self, state: State) -> tuple[Policy, Normalizer, Array]:
-        """The actor mu itself, whose faults the replay must show, and the spread of pi around it."""
+        """The actor mu itself, so that the replay shows what the newest update does, and the spread of pi around it."""
         return state.actor, state.normalizer, state.std
 
     def fit(self, state: State, batch: Batch, *, key: PRNGKeyArray) -> tuple[State, Metrics]:
@@ -94,14 +83,17 @@ class MBDPG:
             likelihood=c.likelihood,
             mean_weight=c.mean_weight,
         )
-        updates, memory = self._optimizers.dynamics.update(gradient, state.dynamics_optimizer)
+        updates, optimizer_state = self._optimizers.dynamics.update(gradient, state.dynamics_optimizer)
         dynamics = optax.apply_updates(state.dynamics, updates)
-        metrics |= {"dynamics/grad_norm": optax.tree.norm(gradient), "dynamics/skipped": memory.total_notfinite}
+        metrics |= {
+            "dynamics/grad_norm": optax.tree.norm(gradient),
+            "dynamics/skipped": optimizer_state.total_notfinite,
+        }
         average = self._average(state.average_dynamics, dynamics, state.fits)
         state = eqx.tree_at(
             lambda x: (x.dynamics, x.average_dynamics, x.dynamics_optimizer, x.fits),
             state,
-            (dynamics, average, memory, state.fits + 1),
+            (dynamics, average, optimizer_state, state.fits + 1),
         )
         return state, metrics
 
@@ -190,7 +182,7 @@ class MBDPG:
     def _step_critics(self, state: State, gradient: Critics) -> State:
         """Step the critics, then let the targets follow every C-th time."""
         c = self.config
-        updates, memory = self._optimizers.critic.update(gradient, state.critic_optimizer)
+        updates, optimizer_state = self._optimizers.critic.update(gradient, state.critic_optimizer)
         critics = optax.apply_updates(state.critics, updates)
         count = state.updates + 1
         rate = jnp.where(jnp.mod(count, c.target_update_every) == 0, c.target_update_rate, 0.0)
@@ -198,17 +190,19 @@ class MBDPG:
         return eqx.tree_at(
             lambda x: (x.critics, x.critic_optimizer, x.target_critics, x.target_actor, x.updates),
             state,
-            (critics, memory, *targets, count),
+            (critics, optimizer_state, *targets, count),
         )
 
     def _step_actor(self, state: State, gradient: Policy) -> State:
-        updates, memory = self._optimizers.actor.update(gradient, state.actor_optimizer)
+        updates, optimizer_state = self._optimizers.actor.update(gradient, state.actor_optimizer)
         actor = optax.apply_updates(state.actor, updates)
-        average = self._average(state.average_actor, actor, state.updates)
-        return eqx.tree_at(lambda x: (x.actor, x.average_actor, x.actor_optimizer), state, (actor, average, memory))
+        average = self._average(state.average_actor, actor, state.updates - 1)  # the critics' step has counted this one
+        return eqx.tree_at(
+            lambda x: (x.actor, x.average_actor, x.actor_optimizer), state, (actor, average, optimizer_state)
+        )
 
     def _average(self, average: Any, newest: Any, count: Array) -> Any:
-        """Take over so much of the newest that the average reaches back over `average_share` of `count` updates."""
+        """Move to the newest so that weights fade over `average_share` of the updates, `count` before this one."""
         return optax.incremental_update(
             newest, average, 1.0 / (1.0 + self.config.average_share * count.astype(jnp.float32))
         )
@@ -222,7 +216,7 @@ class MBDPG:
         if self.config.imagination_ratio == 0.0:
             return real
         batch = alive.shape[0]
-        model = Start(*state.imagined.sample(batch, key=key))
+        model = state.imagined.sample(batch, key=key)
         use = (jnp.arange(batch) < round(self.config.imagination_ratio * batch)) & (model.weight > 0.0)
         return jax.tree.map(lambda m, r: jnp.where(use.reshape((-1,) + (1,) * (r.ndim - 1)), m, r), model, real)
 

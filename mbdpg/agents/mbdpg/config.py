@@ -57,7 +57,7 @@ class Config:
     target_update_every: int = 1
     """Actor and critic updates between two updates of the targets, the paper's C."""
     average_share: float = 0.05
-    """Share of their updates, the last, over which the dynamics that imagine and the evaluated policy are averaged."""
+    """Averages imagine and are evaluated, of dynamics and actor, with weights that fade over this share of updates."""
     target_noise: float = 0.2
     """Standard deviation of the noise on target actions."""
     exploration_std: float = 0.3

@@ -1,4 +1,4 @@
-"""Measurements of MBDPG on episodes that it has never learned from."""
+"""Measurements of MBDPG on episodes of its learned policy that it has never learned from."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def measure(config: Config, state: State, window: Window, realized_return: Float
     )
     now = window.observation[:, config.burn_in]
     value = objectives.clipped_value(state.critics(now, window.action[:, config.burn_in])) * state.return_scale
-    imagined = _imagine(state, state.actor, now, memory, depth=max(DEPTHS), printed=False)
+    imagined = _imagine(state, state.average_actor, now, memory, depth=max(DEPTHS), printed=False)
     few = slice(config.burn_in, config.burn_in + NEAR)
     paid = window.reward[:, few] * state.scales.reward + window.terminal_reward[:, few] * state.scales.terminal_reward
     exists = window.valid[:, few]
