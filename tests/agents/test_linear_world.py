@@ -1,7 +1,7 @@
 """What can be worked out by hand in a linear world: the gradients of Eq. 18 and 19, and the fixed point of Eq. 16.
 
 The world is an ordinary `MixtureDynamics` without hidden layers, so that its outputs are affine in observation and
-action (and rewards in the next observation too); policy and critics have no hidden layers either.
+action (and rewards in the change of observation too); policy and critics have no hidden layers either.
 """
 
 import functools
