@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import (
     Any,
@@ -36,8 +36,8 @@ def require(condition: bool, message: str) -> None:
         raise UserError(message)
 
 
-def require_settings(config: Any, *, positive: Sequence[str] = (), shares: Sequence[str] = ()) -> None:
-    """Check a config's choices and numbers: `positive` ones, `shares` in [0, 1], and all others at least 0."""
+def require_settings(config: Any, *, positive: Sequence[str] = (), at_most: Mapping[str, float] = {}) -> None:
+    """Check a config's choices and numbers: `positive` ones, those from 0 to a bound, and all others at least 0."""
     kinds = get_type_hints(type(config))
     for field in dataclasses.fields(config):
         value, kind = getattr(config, field.name), kinds[field.name]
@@ -49,8 +49,9 @@ def require_settings(config: Any, *, positive: Sequence[str] = (), shares: Seque
         wanted = (int, float) if kind is float else kind
         fits = isinstance(value, wanted) and not isinstance(value, bool)
         require(fits, f"{flag} is {value!r}, expected {kind.__name__}")
-        if field.name in shares:
-            require(0.0 <= value <= 1.0, f"{flag} is {value}, expected a number from 0 to 1")
+        if field.name in at_most:
+            bound = at_most[field.name]
+            require(0.0 <= value <= bound, f"{flag} is {value}, expected a number from 0 to {bound:g}")
         elif field.name in positive:
             require(0.0 < value < math.inf, f"{flag} is {value}, expected a number above 0")
         else:

@@ -12,7 +12,7 @@ import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from mbdpg.agents import objectives
-from mbdpg.interfaces import Batch, EnvSpec, Metrics, Phase, Sampling, Statistics, require, require_settings
+from mbdpg.interfaces import Batch, EnvSpec, Metrics, Phase, Sampling, Statistics, require_settings
 from mbdpg.networks.critic import Critics
 from mbdpg.networks.normalizer import Normalizer, identity
 from mbdpg.networks.policy import Policy
@@ -53,10 +53,8 @@ class Config:
         require_settings(
             self,
             positive=("batch_size", "updates_per_step", "policy_delay", "learning_rate", "width"),
-            shares=("discount", "target_update_rate", "exploration_scatter"),
+            at_most={"discount": 1, "target_update_rate": 1, "exploration_scatter": 1, "exploration_color": 2},
         )
-        color = self.exploration_color
-        require(color <= 2.0, f"--exploration-color is {color}, expected a number from 0 (white) to 2 (red)")
 
 
 class State(eqx.Module):

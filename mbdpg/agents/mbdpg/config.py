@@ -7,7 +7,7 @@ from typing import Literal
 
 from mbdpg.agents.objectives import RewardWeights
 from mbdpg.dynamics.fitting import Likelihood
-from mbdpg.interfaces import require, require_settings
+from mbdpg.interfaces import require_settings
 
 
 @dataclass(frozen=True)
@@ -105,14 +105,8 @@ class Config:
                 *("actor_clip", "critic_clip", "target_update_every", "fit_length", "fit_batch_size", "fits_per_step"),
                 *("dynamics_learning_rate", "dynamics_clip", "gaussians", "memory", "width"),
             ),
-            shares=(
-                "discount",
-                "trace",
-                "imagination_ratio",
-                "target_update_rate",
-                "average_share",
-                "exploration_scatter",
-            ),
+            at_most={
+                **{"discount": 1, "trace": 1, "imagination_ratio": 1, "target_update_rate": 1, "average_share": 1},
+                **{"exploration_scatter": 1, "exploration_color": 2},
+            },
         )
-        color = self.exploration_color
-        require(color <= 2.0, f"--exploration-color is {color}, expected a number from 0 (white) to 2 (red)")
