@@ -209,17 +209,19 @@ def test_an_unknown_verb_is_answered_with_the_known_ones(say: Any) -> None:
         (("Pendulum-v9",), "Pendulum-v9 is not registered; nearest are"),
         (("CartPole-v1",), "expected a bounded 1-D Box of floats"),
         (("hostile:Env-v0",), "would run the code of the module hostile; if you trust it, pass --allow-import"),
-        (("Pendulum-v1", "--steps", "325"), "steps is 325, expected a multiple of cycle, 50"),
-        (("Pendulum-v1", "--steps", "0"), "steps is 0, expected at least 1"),
+        (("Pendulum-v1", "--steps", "325"), "--steps is 325, expected a multiple of --cycle, 50"),
+        (("Pendulum-v1", "--steps", "0"), "--steps is 0, expected at least 1"),
         (("Pendulum-v1", "--width", "0"), "--width is 0"),
         (("Pendulum-v1", "--discount", "1.5"), "--discount is 1.5, expected a number from 0 to 1"),
         (("Pendulum-v1", "--actor-learning-rate", "nan"), "--actor-learning-rate is nan"),
         (("Pendulum-v1", "--preset", "big"), "unknown --preset 'big'"),
         (("Pendulum-v1", "--algorithm", "ppo"), "unknown --algorithm 'ppo'; expected one of mbdpg, td3"),
-        (("Pendulum-v1", "--seeds", "1", "1"), "seeds are [1, 1], expected different numbers"),
-        (("Pendulum-v1", "--seeds", "-1"), "seeds are [-1]"),
-        (("Pendulum-v1", "--max-episode-steps", "0"), "max_episode_steps is 0"),
+        (("Pendulum-v1", "--seeds", "1", "1"), "--seeds are [1, 1], expected one number or more, all different"),
+        (("Pendulum-v1", "--seeds", "-1"), "--seeds are [-1], expected numbers from 0"),
+        (("Pendulum-v1", "--max-episode-steps", "0"), "--max-episode-steps is 0"),
         (("Pendulum-v1", "--observation-size", "27"), "only Ant-v5 lets you choose"),
+        (("Pendulum-v1", "--reference-return", "nan"), "--reference-return is nan, expected a finite number"),
+        (("",), "an empty id is not registered; nearest are"),
         (("Pendulum-v1", "--demonstrations", "missing.safetensors"), "missing.safetensors is missing"),
     ],
     ids=str,
@@ -258,6 +260,19 @@ def test_a_run_that_never_saved_anything_is_said_so(say: Any, trained: Path) -> 
     check_refused(say("evaluate", "run"), "has no latest.safetensors yet")
 
 
+def test_a_folder_of_runs_is_answered_with_one_of_them(say: Any, trained: Path) -> None:
+    shutil.copytree(trained, "runs/seed-0")
+    check_refused(say("evaluate", "runs"), "runs is not a run folder", "expected one of its runs, such as runs/seed-0")
+    said = say("demonstrate", "Pendulum-v1", "--out", "good.safetensors", "--expert", "runs")
+    check_refused(said, "runs is not a run folder", "such as runs/seed-0")
+
+
+def test_a_second_expert_in_the_same_place_is_refused_with_a_way_on(say: Any, trained: Path) -> None:
+    shutil.copytree(trained, "good-expert/seed-0")
+    said = say("demonstrate", "Pendulum-v1", "--out", "good.safetensors")
+    check_refused(said, "has an expert already: take it with --expert good-expert/seed-0", "choose another --out")
+
+
 def test_training_where_something_is_already_says_resume(say: Any, trained: Path) -> None:
     shutil.copytree(trained, "run/seed-0")
     before = sorted(path.name for path in Path("run").rglob("*"))
@@ -270,6 +285,7 @@ def test_training_where_something_is_already_says_resume(say: Any, trained: Path
     ("flags", "said"),
     [
         (("--episodes", "0"), "--episodes is 0, expected at least 1"),
+        (("--seed", "-1"), "--seed is -1, expected at least 0"),
         (("--video", "film.gif"), "expected a name that ends in .mp4"),
         (("--video", "file/film.mp4"), "cannot write file/film.mp4"),
     ],
@@ -286,7 +302,8 @@ def test_an_evaluation_that_cannot_be_is_refused(say: Any, trained: Path, flags:
     [
         (("Humanoid-v5",), "nobody knows what a success in Humanoid-v5 is; say so with --success-return"),
         (("Pendulum-v1", "--episodes", "0"), "--episodes is 0"),
-        (("Pendulum-v1", "--steps", "30"), "steps is 30"),
+        (("Pendulum-v1", "--steps", "30"), "--steps is 30"),
+        (("Pendulum-v1", "--success-return", "nan"), "--success-return is nan, expected a finite number"),
         (("Pendulum-v1", "--expert", "missing"), "missing"),
         (("Pendulum-v9",), "is not registered"),
     ],
@@ -373,6 +390,17 @@ def test_an_unexpected_error_is_one_line_too(say: Any, monkeypatch: Any) -> None
     assert said == Said(1, "", "mbdpg: unexpected RuntimeError: first second; --debug shows where\n")
     with pytest.raises(RuntimeError):
         main(["train", "Pendulum-v1", "--debug"])
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("INTERNAL: Out of memory allocating 8e16 bytes.")])
+def test_too_little_memory_is_said_with_the_flags_that_lower_it(say: Any, monkeypatch: Any, error: Exception) -> None:
+    def fail(arguments: list[str]) -> None:
+        raise error
+
+    monkeypatch.setitem(VERBS, "train", fail)
+    check_refused(
+        say("train", "Pendulum-v1"), "not enough memory", "lower --width, --memory, --batch-size or --horizon"
+    )
 
 
 def test_ctrl_c_where_there_is_nothing_to_save_is_no_traceback(say: Any, monkeypatch: Any) -> None:

@@ -28,6 +28,9 @@ from mbdpg.storage.run_folder import RunFolder
 from mbdpg.training.evaluation import evaluate
 from mbdpg.training.loop import Schedule
 
+EnvArgument = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ENV")]
+RunArgument = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+
 
 @dataclass(frozen=True)
 class RunOptions:
@@ -36,7 +39,7 @@ class RunOptions:
     algorithm: Algorithm = "mbdpg"
     """Algorithm to train."""
     preset: presets.Preset = "default"
-    """Settings that measured best, or those of the paper; flags given go before both."""
+    """Settings that measured best, or those of the paper; other flags change single ones."""
     seeds: tuple[int, ...] = (0,)
     """Random seeds; each is a run of its own, all in this process."""
     out: Path | None = None
@@ -51,7 +54,7 @@ class RunOptions:
 class Resume:
     """Go on with a run, or with all runs in a folder, exactly where they stopped."""
 
-    run: tyro.conf.Positional[Path]
+    run: RunArgument
     """Run folder, or a folder of run folders."""
     steps: int | None = None
     """Environment steps of the whole run, to make it longer than planned."""
@@ -65,7 +68,7 @@ class Resume:
 class Evaluate:
     """Run a learned policy without exploration, and film it if asked to; no display is needed."""
 
-    run: tyro.conf.Positional[Path]
+    run: RunArgument
     """Run folder."""
     episodes: int = 10
     """Number of episodes."""
@@ -85,14 +88,14 @@ class Evaluate:
 class Demonstrate:
     """Train an expert with TD3, or take one from a run, and record its successful episodes (Section 4.2)."""
 
-    env: tyro.conf.Positional[str]
-    """Gymnasium id."""
+    env: EnvArgument
+    """Gymnasium id, as in HalfCheetah-v5."""
     out: Path
-    """File to write, for example demonstrations.safetensors."""
+    """File to write, for example demonstrations.safetensors; the expert's run is kept in demonstrations-expert/."""
     steps: int = 200_000
     """Environment steps of the expert's training."""
     expert: Path | None = None
-    """Run folder of an expert that is trained already, by any algorithm."""
+    """Run folder of an expert that is trained already, by any algorithm; else TD3 is trained."""
     episodes: int = 10
     """Successful episodes to record."""
     success_return: float | None = None
@@ -113,7 +116,7 @@ def _train(args: list[str]) -> None:
     command = dataclasses.make_dataclass(
         "Train",
         [
-            ("env", Annotated[tyro.conf.Positional[str], tyro.conf.arg(help="Gymnasium id, as in HalfCheetah-v5.")]),
+            ("env", Annotated[EnvArgument, tyro.conf.arg(help="Gymnasium id, as in HalfCheetah-v5.")]),
             ("run", flat[RunOptions], field(default_factory=RunOptions)),
             ("schedule", flat[Schedule], field(default=schedule)),
             ("env_options", flat[EnvOptions], field(default=env_options)),
@@ -168,6 +171,7 @@ def _resume(args: list[str]) -> None:
 def _evaluate(args: list[str]) -> None:
     flags = parse(Evaluate, "evaluate", args)
     require(flags.episodes >= 1, f"--episodes is {flags.episodes}, expected at least 1")
+    require(flags.seed >= 0, f"--seed is {flags.seed}, expected at least 0")
     folder = RunFolder.open(flags.run)
     config = RunConfig.from_json(folder.config)
     require(not folder.config.get("custom_env"), f"{flags.run} trained an environment made in code: use mbdpg.evaluate")
@@ -189,9 +193,8 @@ def _evaluate(args: list[str]) -> None:
             print(f"episode {episode}: return {outcome.returns[0]:.1f}, {outcome.lengths[0]} steps")
     env.close()
     require(len(returns) > 0, f"{config.env} failed in every episode (see above): mend it, then evaluate again")
-    print(
-        f"{len(returns)} episodes: return {np.mean(returns):.1f} ± {np.std(returns):.1f}, {np.mean(lengths):.0f} steps"
-    )
+    mean, spread, length = np.mean(returns), np.std(returns), np.mean(lengths)
+    print(f"{len(returns)} episode{'s' * (len(returns) > 1)}: return {mean:.1f} ± {spread:.1f}, {length:.0f} steps")
     if flags.video is not None:
         print(f"video of the first episode in {flags.video}")
 
@@ -207,6 +210,12 @@ def make_demonstrations(flags: Demonstrate) -> None:
     run = flags.expert
     if run is None:
         folder = flags.out.parent / f"{flags.out.stem}-expert"
+        trained = folder / f"seed-{flags.seed}"
+        require(
+            not trained.exists(),
+            f"{trained} has an expert already: take it with --expert {trained}, after more training if it needs that "
+            f"(mbdpg resume {trained} --steps N), or choose another --out",
+        )
         config = expert.config_of(flags.env, flags.steps, flags.env_options)
         with Stop() as stop:
             with RunDisplay(flags.steps) as display:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes.util
 import difflib
 import functools
 import importlib
@@ -19,6 +18,7 @@ import numpy as np
 from gymnasium.error import DependencyNotInstalled
 from gymnasium.spaces import Box
 
+from mbdpg.envs.rendering import prepare_headless_rendering, rendering_options, widen_floor
 from mbdpg.envs.wrappers import GymnasiumEnvironment, cannot_draw, missing_package, with_fresh_world
 from mbdpg.interfaces import EnvSpec, UserError
 
@@ -46,9 +46,6 @@ ANT_CONTACT_FORCES = {27: False, 105: True}  # observation size of Ant-v5, to wh
 
 MakeGymnasium = Callable[[], gymnasium.Env[Any, Any]]
 """Makes an environment of a user's own."""
-
-# The default camera stays where the robot began, and soon films an empty floor.
-TRACKED = {f"{name}-v5" for name in ("Ant", "HalfCheetah", "Hopper", "Humanoid", "Swimmer", "Walker2d")}
 
 ROLES = ("train", "evaluate", "expert", "test")
 
@@ -81,15 +78,15 @@ def make(
         UserError: the id is unknown, the environment does not fit, or a package it needs is missing.
     """
     if max_episode_steps is not None and max_episode_steps < 1:
-        raise UserError(f"max_episode_steps is {max_episode_steps}, expected at least 1; or leave it out")
+        raise UserError(f"--max-episode-steps is {max_episode_steps}, expected at least 1; or leave it out")
     known_id = _known_id(env_id, allow_import)
     options = _ant_options(known_id, observation_size)
     if render:
         prepare_headless_rendering()
-        options["render_mode"] = "rgb_array"
-        if known_id in TRACKED:
-            options["camera_name"] = "track"
+        options |= rendering_options(known_id)
     env = _create(known_id, max_episode_steps, options)
+    if render:
+        widen_floor(env, known_id)
     try:
         return wrap(env)
     except UserError:
@@ -146,23 +143,6 @@ def episode_seed(run_seed: int, role: str, episode: int) -> int:
     return number << 29 | word >> 3
 
 
-def prepare_headless_rendering() -> None:
-    """On Linux without a display, lets MuJoCo and SDL draw without one, unless the user chose how already.
-
-    They read the choice from the environment variables MUJOCO_GL and SDL_VIDEODRIVER, so this changes `os.environ`.
-    """
-    if not sys.platform.startswith("linux") or os.environ.get("DISPLAY"):
-        return
-    if not os.environ.get("SDL_VIDEODRIVER"):
-        os.environ["SDL_VIDEODRIVER"] = "dummy"
-    if not os.environ.get("MUJOCO_GL"):
-        # Only a library that is there: with a bad MUJOCO_GL not even training works, for mujoco cannot be imported.
-        for back_end, library in (("egl", "EGL"), ("osmesa", "OSMesa")):
-            if ctypes.util.find_library(library):
-                os.environ["MUJOCO_GL"] = back_end
-                return
-
-
 def _known_id(env_id: str, allow_import: bool) -> str:
     """Returns the registered id that `env_id` means; imports its module first if it names one and that is allowed."""
     module, separator, name = env_id.rpartition(":")
@@ -177,9 +157,9 @@ def _known_id(env_id: str, allow_import: bool) -> str:
         _say_once(f"{name} is no longer in Gymnasium; using {OLD_IDS[name]}")
         return OLD_IDS[name]
     if name not in gymnasium.registry:
-        by_lower_case = {known.lower(): known for known in gymnasium.registry if known not in OLD_IDS}
-        nearest = difflib.get_close_matches(name.lower(), by_lower_case, n=3, cutoff=0.0)
-        raise UserError(f"{name} is not registered; nearest are {', '.join(by_lower_case[near] for near in nearest)}")
+        ids = {known.lower(): known for known in gymnasium.registry if known not in OLD_IDS}
+        nearest = difflib.get_close_matches(name.lower(), ids, n=3, cutoff=0.0)
+        raise UserError(f"{name or 'an empty id'} is not registered; nearest are {', '.join(ids[n] for n in nearest)}")
     return name
 
 

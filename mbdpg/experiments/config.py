@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -29,6 +30,10 @@ class EnvOptions:
     """Return at which the task is solved, for exploration and beta to follow; by default what is known of it."""
     allow_import: bool = False
     """Allow an id of the form module:Id, which imports and so runs that module's code."""
+
+    def __post_init__(self) -> None:
+        given = self.reference_return
+        require(given is None or math.isfinite(given), f"--reference-return is {given}, expected a finite number")
 
 
 @dataclass(frozen=True)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 from mbdpg.experiments.config import EnvOptions, RunConfig
 from mbdpg.experiments.presets import agent_config
 from mbdpg.experiments.run import load_policy, policy_facts
 from mbdpg.imitation.demonstrations import Demonstrations, record
-from mbdpg.interfaces import UserError
+from mbdpg.interfaces import UserError, require
+from mbdpg.storage.run_folder import RunFolder
 from mbdpg.training.loop import Schedule
 
 
@@ -23,6 +25,7 @@ def success_in(env: str, env_options: EnvOptions, given: float | None) -> float:
     Raises:
         UserError: nobody knows, or there is no such environment.
     """
+    require(given is None or math.isfinite(given), f"--success-return is {given}, expected a finite number")
     made = RunConfig(env, env_options=env_options).make_env()
     made.close()
     success = made.spec.reference_return if given is None else given
@@ -51,8 +54,9 @@ def record_from(
         seed: decides the episodes.
 
     Raises:
-        UserError: there was no success, or the policy is for another environment.
+        UserError: there was no success, it is no run, or its policy is for another environment.
     """
+    RunFolder.open(run)
     made = RunConfig(env, env_options=env_options).make_env()
     try:
         policy = load_policy(run, best=True, spec=made.spec)

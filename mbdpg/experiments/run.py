@@ -56,8 +56,9 @@ def train(
     Raises:
         UserError: something the caller can mend; then no folder is left behind.
     """
-    require(len(seeds) > 0 and len(set(seeds)) == len(seeds), f"seeds are {list(seeds)}, expected different numbers")
-    require(all(0 <= seed < 2**31 for seed in seeds), f"seeds are {list(seeds)}, expected numbers from 0 to 2^31 - 1")
+    given = f"--seeds are {list(seeds)}, expected"
+    require(len(seeds) > 0 and len(set(seeds)) == len(seeds), f"{given} one number or more, all different")
+    require(all(0 <= seed < 2**31 for seed in seeds), f"{given} numbers from 0 to 2^31 - 1")
     make = make_env or config.make_env
     spec = _spec_of(make)
     demonstrations = Demonstrations.load(Path(config.demonstrations), spec) if config.demonstrations else None

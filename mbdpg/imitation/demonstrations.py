@@ -95,7 +95,8 @@ def record(
     if not returns:
         raise UserError(
             f"none of {tried} episodes of the expert was a success: the best return was {best:.1f}, expected at least "
-            f"{success_return:.1f}; train it longer (--steps) or lower --success-return"
+            f"{success_return:.1f}; train the expert longer (mbdpg resume RUN --steps N) or lower --success-return, "
+            "and give it with --expert RUN"
         )
     facts = {"success_return": success_return, "returns": returns, "tried": tried, "seed": seed}
     return Demonstrations(kept, env.spec.id, expert_env_steps, facts)

@@ -13,6 +13,9 @@ from rich.progress import BarColumn, Progress, TextColumn
 PLAIN_SECONDS = 30.0
 """Between two plain lines, so that a log file stays readable."""
 
+UNTIMED_SECONDS = 2.0
+"""So early, a speed says nothing of those to come."""
+
 
 class RunDisplay:
     """Shows steps, returns, speed and time left. Use it in a `with` block and call it after every cycle."""
@@ -54,7 +57,7 @@ class RunDisplay:
 
     def _text(self, train_returns: list[float]) -> str:
         seconds = time.monotonic() - self._began
-        speed = (self._done - self._first) / max(seconds, 1e-9)
+        speed = (self._done - self._first) / seconds if seconds > UNTIMED_SECONDS else 0.0
         known = [value for value in train_returns if np.isfinite(value)]
         episode = f"{np.mean(known):.1f}" if known else "-"
         left = _duration((self._steps - self._done) / speed) if speed > 0 else "-"

@@ -87,7 +87,9 @@ class RunFolder:
                 raise UserError(f"{path} is not a folder; expected one that `mbdpg train --out` made")
             content = parse_object(read_checked(name, limit=MAX_CONFIG_BYTES), name)
         except DamagedFileError as damage:
-            raise UserError(f"{path} is not a run folder: {damage}") from damage
+            runs = sorted(found.parent for found in path.glob(f"*/{_CONFIG}"))
+            hint = f"; expected one of its runs, such as {runs[0]}" if runs else ""
+            raise UserError(f"{path} is not a run folder: {damage}{hint}") from damage
         except OSError as error:
             raise UserError(f"cannot open {path}: {error.strerror}") from error
         if content.get("format") != FORMAT or not isinstance(content.get("run"), dict):

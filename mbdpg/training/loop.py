@@ -39,10 +39,12 @@ class Schedule:
 
     def __post_init__(self) -> None:
         for name in ("steps", "cycle", "evaluate_every", "evaluation_episodes", "log_every", "checkpoint_every"):
-            require(getattr(self, name) >= 1, f"{name} is {getattr(self, name)}, expected at least 1")
+            flag = "--" + name.replace("_", "-")
+            require(getattr(self, name) >= 1, f"{flag} is {getattr(self, name)}, expected at least 1")
         for name in ("steps", "evaluate_every", "log_every", "checkpoint_every"):
             whole = getattr(self, name) % self.cycle == 0
-            require(whole, f"{name} is {getattr(self, name)}, expected a multiple of cycle, {self.cycle}")
+            flag = "--" + name.replace("_", "-")
+            require(whole, f"{flag} is {getattr(self, name)}, expected a multiple of --cycle, {self.cycle}")
 
 
 class Update(NamedTuple):
@@ -53,6 +55,10 @@ class Update(NamedTuple):
     """Last finished training episode of each seed; NaN before the first."""
     evaluation: list[Evaluation] | None
     """One per seed, when there was one."""
+
+
+class StoppedError(Exception):
+    """Asked to stop in the middle of an evaluation; a resumed run begins it again."""
 
 
 @runtime_checkable
@@ -102,13 +108,14 @@ class Training:
         A stop may come between any two calls of an update: what is due at a step is a function of the step, so a
         resumed run first takes the updates that are missing and goes on as if nothing had happened.
         """
-        while self._learn(should_stop):
-            policies, stds = self.learner.behaviors()
-            if self._recorded < self.env_steps:
-                on_update(self._record(stds))
-            if self.env_steps >= self.schedule.steps or should_stop():
-                break
-            self._collect(policies, stds)  # Algorithm 1, line 5
+        with contextlib.suppress(StoppedError):
+            while self._learn(should_stop):
+                policies, stds = self.learner.behaviors()
+                if self._recorded < self.env_steps:
+                    on_update(self._record(stds, should_stop))
+                if self.env_steps >= self.schedule.steps or should_stop():
+                    break
+                self._collect(policies, stds)  # Algorithm 1, line 5
         if self._saved != (self.env_steps, *self._updates.values()):
             self.save()
 
@@ -141,11 +148,11 @@ class Training:
         for collector, fact in zip(self.collectors, facts, strict=True):
             collector.restore(fact["collector"])
 
-    def _record(self, stds: np.ndarray) -> Update:
+    def _record(self, stds: np.ndarray, should_stop: Callable[[], bool]) -> Update:
         """Evaluate, log and save, each if it is due at this step."""
         schedule = self.schedule
+        evaluation = self._evaluate(should_stop) if self._due(schedule.evaluate_every) else None
         self._recorded = self.env_steps
-        evaluation = self._evaluate() if self._due(schedule.evaluate_every) else None
         if self._due(schedule.log_every):
             self._log(stds)
         if self._due(schedule.checkpoint_every):
@@ -196,7 +203,7 @@ class Training:
                 total, count = sums.get(name, (0.0, 0))
                 sums[name] = [total + float(values[index]), count + 1]
 
-    def _evaluate(self) -> list[Evaluation]:
+    def _evaluate(self, should_stop: Callable[[], bool]) -> list[Evaluation]:
         began = time.monotonic()
         policies, evaluations = self.learner.policies(), []
         for collector, policy in zip(self.collectors, policies, strict=True):
@@ -207,7 +214,7 @@ class Training:
             ]
             # A fresh environment: a resumed run has no used one, and a fault must not outlive its evaluation.
             with contextlib.closing(self._make_env()) as env:
-                evaluations.append(evaluate(env, policy, seeds))
+                evaluations.append(evaluate(env, _stoppable(policy, should_stop), seeds))
         metrics = self._diagnose(evaluations)
         self._seconds["evaluating"] += time.monotonic() - began
         for index, (recorder, evaluation) in enumerate(zip(self._recorders, evaluations, strict=True)):
@@ -256,3 +263,14 @@ class Training:
         """Seconds since this process began the run, and where they went."""
         parts = {f"time/{name}": seconds for name, seconds in self._seconds.items()}
         return {"time/seconds": time.monotonic() - self._began} | parts
+
+
+def _stoppable(policy: NumpyPolicy, should_stop: Callable[[], bool]) -> Callable[[np.ndarray], np.ndarray]:
+    """The policy, until asked to stop: an episode of somebody's environment may take minutes, or never end."""
+
+    def act(observation: np.ndarray) -> np.ndarray:
+        if should_stop():
+            raise StoppedError
+        return policy(observation)
+
+    return act

@@ -15,7 +15,8 @@ import pytest
 from gymnasium.spaces import Box, Dict, Discrete
 
 import mbdpg.envs
-from mbdpg.envs.make import OLD_IDS, TRACKED, _layers, _quiet_construction, _say_once
+from mbdpg.envs.make import OLD_IDS, _layers, _quiet_construction, _say_once
+from mbdpg.envs.rendering import TRACKED
 from mbdpg.interfaces import EnvSpec, UserError
 
 REPOSITORY = Path(mbdpg.envs.__file__).parents[2]
@@ -91,7 +92,7 @@ def test_the_time_limit_truncates_and_never_terminates() -> None:
 
 
 def test_a_time_limit_below_one_is_refused() -> None:
-    with pytest.raises(UserError, match="max_episode_steps is 0, expected at least 1"):
+    with pytest.raises(UserError, match="--max-episode-steps is 0, expected at least 1"):
         mbdpg.envs.make("Pendulum-v1", max_episode_steps=0)
 
 
@@ -333,7 +334,11 @@ def test_an_episode_seed_needs_a_known_role_and_no_negative_numbers() -> None:
 
 
 @pytest.mark.parametrize("env_id", sorted(TRACKED))
-def test_the_camera_follows_the_robot(env_id: str) -> None:
+def test_the_camera_follows_the_robot_over_a_floor_without_an_end(env_id: str) -> None:
     env = mbdpg.envs.make(env_id, render=True)
     assert env._env.unwrapped.mujoco_renderer.camera_id == env._env.unwrapped.model.camera("track").id
+    plain = mbdpg.envs.make(env_id)
+    width, small = (made._env.unwrapped.model.geom("floor").size[0] for made in (env, plain))
+    assert width == 100 * small >= 1000
+    plain.close()
     env.close()

@@ -129,7 +129,7 @@ def test_evaluation_steps_never_reach_the_replay(whole: Any) -> None:
     assert evaluated and not learned & evaluated
 
 
-@pytest.mark.parametrize("cuts", [[1], [30], [44], [70], [3, 3, 3], [41, 2, 9]], ids=str)
+@pytest.mark.parametrize("cuts", [[1], [16], [30], [44], [60], [90], [120], [3, 3, 3], [55, 2, 9]], ids=str)
 def test_a_run_stopped_anywhere_and_resumed_equals_one_that_was_not(whole: Any, toy: Any, cuts: list[int]) -> None:
     _, (expected, _), _ = whole
     training, (recorder,) = toy.toy_training([0])
@@ -153,9 +153,24 @@ def test_a_run_stopped_anywhere_and_resumed_equals_one_that_was_not(whole: Any, 
     assert bytes_of(columns) == bytes_of(columns_whole)
 
 
+EVALUATION_STEPS = range(2 * 7)  # two episodes of the toy; each asks whether to stop
+
+
+def test_an_evaluation_that_never_ends_is_left_when_asked_and_begun_again(whole: Any, toy: Any) -> None:
+    training, (recorder,) = toy.toy_training([0])
+    asked = itertools.count()
+    assert run(training, lambda: next(asked) >= len(EVALUATION_STEPS) // 2) == []
+    env_steps, arrays, facts, columns = recorder.checkpoints[-1]
+    assert env_steps == 0 and facts["recorded"] == -1 and recorder.rows == [] and recorder.policies == []
+    training, (recorder,) = toy.toy_training([0], replay=Replay.from_columns(columns))
+    training.restore(env_steps, [arrays], [facts])
+    run(training)
+    assert recorder.rows == whole[1][0].rows
+
+
 def test_a_stop_between_two_updates_is_saved_there(toy: Any) -> None:
     training, (recorder,) = toy.toy_training([0])
-    asked = itertools.count(1)
+    asked = itertools.count(1 - len(EVALUATION_STEPS))
     updates = run(training, lambda: next(asked) >= 8)
     env_steps, _, facts, _ = recorder.checkpoints[-1]
     assert env_steps == 20 and updates[-1].env_steps == 15  # step 20 was not recorded yet
@@ -275,12 +290,12 @@ def test_when_all_evaluation_episodes_fail_the_row_has_no_return(
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ({"steps": 0}, "steps is 0, expected at least 1"),
+        ({"steps": 0}, "--steps is 0, expected at least 1"),
         ({"cycle": 0}, "cycle is 0"),
-        ({"steps": 125}, "steps is 125, expected a multiple of cycle, 50"),
-        ({"evaluate_every": 30}, "evaluate_every is 30, expected a multiple"),
-        ({"evaluation_episodes": 0}, "evaluation_episodes is 0"),
-        ({"checkpoint_every": -50}, "checkpoint_every is -50"),
+        ({"steps": 125}, "--steps is 125, expected a multiple of --cycle, 50"),
+        ({"evaluate_every": 30}, "--evaluate-every is 30, expected a multiple"),
+        ({"evaluation_episodes": 0}, "--evaluation-episodes is 0"),
+        ({"checkpoint_every": -50}, "--checkpoint-every is -50"),
     ],
     ids=str,
 )
