@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -16,7 +17,7 @@ import numpy as np
 import pytest
 
 import mbdpg
-from mbdpg.cli import main
+from mbdpg.cli import compilations, main
 from mbdpg.cli.verbs import VERBS
 from mbdpg.experiments import expert
 from mbdpg.storage import RunFolder
@@ -41,6 +42,7 @@ def say(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.setattr("mbdpg.cli.keep_compilations", lambda: None)
 
     def run(*arguments: str | Path) -> Said:
         capsys.readouterr()
@@ -409,3 +411,57 @@ def test_ctrl_c_where_there_is_nothing_to_save_is_no_traceback(say: Any, monkeyp
 
     monkeypatch.setitem(VERBS, "evaluate", interrupted)
     assert say("evaluate", "run") == Said(130, "", "")
+
+
+# Compiled programs.
+
+
+class JaxConfig(dict):
+    """What JAX is told."""
+
+    jax_compilation_cache_dir: str | None = None
+    update = dict.__setitem__  # type: ignore[assignment]  # as of a setting, not of a mapping
+
+
+@pytest.fixture
+def jax_config(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> JaxConfig:
+    config = JaxConfig()
+    monkeypatch.setattr(compilations, "jax", SimpleNamespace(config=config))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return config
+
+
+def test_compiled_programs_are_kept_where_nobody_else_writes(
+    jax_config: JaxConfig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    compilations.keep_compilations()
+    first = Path(jax_config["jax_compilation_cache_dir"])
+    assert first.parent == tmp_path / "mbdpg" and first.stat().st_mode & 0o777 == 0o700
+    compilations.keep_compilations()
+    assert Path(jax_config["jax_compilation_cache_dir"]) == first
+    monkeypatch.setattr(compilations, "describe_machine", lambda: {"cpu": "another"})
+    compilations.keep_compilations()
+    assert Path(jax_config["jax_compilation_cache_dir"]) != first
+
+
+def test_compiled_programs_stay_where_jax_was_told_to_keep_them(jax_config: JaxConfig, tmp_path: Path) -> None:
+    jax_config.jax_compilation_cache_dir = "elsewhere"
+    compilations.keep_compilations()
+    assert not jax_config and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("obstacle", ["file", "link"])
+def test_without_a_folder_of_ones_own_everything_is_compiled_anew(
+    jax_config: JaxConfig, tmp_path: Path, obstacle: str
+) -> None:
+    compilations.keep_compilations()
+    folder = Path(jax_config.pop("jax_compilation_cache_dir"))
+    jax_config.clear()
+    folder.rmdir()
+    if obstacle == "file":
+        folder.write_text("")
+    else:
+        (tmp_path / "theirs").mkdir()
+        folder.symlink_to(tmp_path / "theirs")
+    compilations.keep_compilations()
+    assert not jax_config
