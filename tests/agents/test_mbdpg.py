@@ -224,6 +224,27 @@ def test_targets_wait_for_the_third_update_where_c_is_3() -> None:
         np.testing.assert_allclose(new, 0.75 * old + 0.25 * followed, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("trace", [0.0, 0.4, 1.0])
+def test_the_real_step_is_the_first_of_the_expansion(trace: float) -> None:
+    """TD(lambda) over the real step and then the imagined ones, by hand."""
+    one = agent((("trace", trace), ("target_noise", 0.0)))
+    data = jax.tree.map(jnp.asarray, edited(BATCHES["improve"], terminated=((0, -1), 1)))
+    window, key = one._normalized(state(), data), jax.random.key(0)
+    start = one._start(state(), window, key=key)
+    _, (imagined, _) = one._actor_loss(state().actor, state(), start, key)
+    found = one._targets(state(), window, start, imagined, key=key)
+    value = np.asarray(one._target_value(state(), imagined.observations, key=key))
+    rewards, alive = np.asarray(imagined.rewards), np.asarray(imagined.continues)
+    after, along = value[-1], []
+    for t in reversed(range(len(rewards))):
+        after = rewards[t] + 0.99 * alive[t] * ((1 - trace) * value[t + 1] + trace * after)
+        along.insert(0, after)
+    real = np.asarray(one._real_reward(state(), window))
+    real = real + 0.99 * (1 - np.asarray(window.terminated[:, -1])) * ((1 - trace) * value[0] + trace * after)
+    np.testing.assert_allclose(found[0], real, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(found[1], along, rtol=1e-4, atol=1e-5)
+
+
 @MODES
 @pytest.mark.parametrize("poison", [np.nan, np.inf])
 def test_a_batch_that_is_not_finite_moves_nothing_and_is_counted(settings: tuple, poison: float) -> None:

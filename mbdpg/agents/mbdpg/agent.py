@@ -262,7 +262,7 @@ class MBDPG:
         values = self._target_value(state, seen, key=noise_key)
         values = jnp.broadcast_to(values, imagined.observations.shape[:-1])
         expanded = objectives.expanded_values(imagined.rewards, imagined.continues, values, c.discount, c.trace)
-        after = expanded[0]
+        after = (1.0 - c.trace) * values[0] + c.trace * expanded[0]  # the real step is the expansion's first
         if c.imagination_ratio > 0.0:  # where imagination went on from elsewhere, the transition has one step
             one_step = self._target_value(state, window.next_observation[:, -1], key=real_key)
             after = jnp.where(start.depth == 0.0, after, one_step)
