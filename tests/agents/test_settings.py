@@ -50,7 +50,7 @@ def test_an_impossible_setting_is_refused_by_its_flags_name(config: type, name: 
 
 @pytest.mark.parametrize("values", [{"steps": 0}, {"steps": 120}, {"cycle": 0}, {"evaluation_episodes": 0}])
 def test_an_impossible_schedule_is_refused(values: dict[str, int]) -> None:
-    with pytest.raises(UserError, match=next(iter(values))):
+    with pytest.raises(UserError, match="--" + next(iter(values)).replace("_", "-")):
         Schedule(**values)
 
 
