@@ -44,7 +44,7 @@ class Config:
     """Reward t weighs beta times: the value terms after it ("remaining"), or one ("uniform", as printed)."""
     first_value: Literal[0, 1] = 0
     """Imagined step at which the value terms of Eq. 18 begin: 1 as printed, 0 to teach the first action by Q too."""
-    trace: float = 1.0
+    trace: float = 0.5
     """Lambda of the value expansion: 1 is Eq. 16, 0 one-step targets, in between longer expansions count less."""
     imagined_weight: float = 0.5
     """Weight of the critic's loss on imagined states beside that on real transitions."""
