@@ -36,12 +36,17 @@ def require(condition: bool, message: str) -> None:
         raise UserError(message)
 
 
+def flag_of(setting: str) -> str:
+    """The command line's flag for a setting."""
+    return "--" + setting.replace("_", "-")
+
+
 def require_settings(config: Any, *, positive: Sequence[str] = (), at_most: Mapping[str, float] = {}) -> None:
     """Check a config's choices and numbers: `positive` ones, those from 0 to a bound, and all others at least 0."""
     kinds = get_type_hints(type(config))
     for field in dataclasses.fields(config):
         value, kind = getattr(config, field.name), kinds[field.name]
-        flag = "--" + field.name.replace("_", "-")
+        flag = flag_of(field.name)
         if get_origin(kind) is Literal:
             choices = get_args(kind)
             require(value in choices, f"{flag} is {value!r}, expected one of {', '.join(map(str, choices))}")

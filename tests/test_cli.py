@@ -42,7 +42,7 @@ def say(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     monkeypatch.setenv("COLUMNS", "100")
-    monkeypatch.setattr("mbdpg.cli.keep_compilations", lambda: None)
+    monkeypatch.setattr("mbdpg.cli.verbs.keep_compilations", lambda: None)
 
     def run(*arguments: str | Path) -> Said:
         capsys.readouterr()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from mbdpg.cli.compilations import keep_compilations
 from mbdpg.cli.flags import one_line
 from mbdpg.cli.verbs import VERBS
 from mbdpg.interfaces import UserError, require
@@ -30,7 +29,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(OVERVIEW, end="")
         return
     try:
-        keep_compilations()
         require(args[0] in VERBS, f"there is no verb {args[0]!r}; expected one of {', '.join(VERBS)}")
         VERBS[args[0]](args[1:])
     except BrokenPipeError:  # whoever read our output has seen enough

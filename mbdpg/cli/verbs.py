@@ -15,6 +15,7 @@ import numpy as np
 import tyro
 
 from mbdpg import envs
+from mbdpg.cli.compilations import keep_compilations
 from mbdpg.cli.flags import parse, peek
 from mbdpg.cli.stopping import Stop
 from mbdpg.experiments import expert, presets
@@ -126,6 +127,7 @@ def _train(args: list[str]) -> None:
     )
     command.__doc__ = "Learn a policy for a Gymnasium environment."
     flags = parse(command, "train", args)
+    keep_compilations()
     config = RunConfig(flags.env, algorithm, flags.agent, flags.schedule, flags.env_options)
     name = re.sub(r"[^A-Za-z0-9.-]+", "-", flags.env)
     out = flags.run.out or Path("runs") / f"{name}-{algorithm}-{time.strftime('%Y%m%d-%H%M%S')}"
@@ -152,6 +154,7 @@ def _finish(runs: Sequence[Path], algorithm: str, env: str) -> None:
 
 def _resume(args: list[str]) -> None:
     flags = parse(Resume, "resume", args)
+    keep_compilations()
     runs = [flags.run]
     if flags.run.is_dir() and not (flags.run / "config.json").exists():
         runs = sorted(path.parent for path in flags.run.glob("seed-*/config.json")) or runs
@@ -200,7 +203,9 @@ def _evaluate(args: list[str]) -> None:
 
 
 def _demonstrate(args: list[str]) -> None:
-    make_demonstrations(parse(Demonstrate, "demonstrate", args))
+    flags = parse(Demonstrate, "demonstrate", args)
+    keep_compilations()
+    make_demonstrations(flags)
 
 
 def make_demonstrations(flags: Demonstrate) -> None:

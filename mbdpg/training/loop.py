@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from mbdpg.envs import episode_seed
-from mbdpg.interfaces import Environment, Metrics, Phase, require
+from mbdpg.interfaces import Environment, Metrics, Phase, flag_of, require
 from mbdpg.networks.policy import NumpyPolicy
 from mbdpg.training.collector import Collector
 from mbdpg.training.evaluation import Evaluation, diagnosis_windows, evaluate
@@ -39,12 +39,11 @@ class Schedule:
 
     def __post_init__(self) -> None:
         for name in ("steps", "cycle", "evaluate_every", "evaluation_episodes", "log_every", "checkpoint_every"):
-            flag = "--" + name.replace("_", "-")
-            require(getattr(self, name) >= 1, f"{flag} is {getattr(self, name)}, expected at least 1")
+            require(getattr(self, name) >= 1, f"{flag_of(name)} is {getattr(self, name)}, expected at least 1")
         for name in ("steps", "evaluate_every", "log_every", "checkpoint_every"):
-            whole = getattr(self, name) % self.cycle == 0
-            flag = "--" + name.replace("_", "-")
-            require(whole, f"{flag} is {getattr(self, name)}, expected a multiple of --cycle, {self.cycle}")
+            value = getattr(self, name)
+            whole = value % self.cycle == 0
+            require(whole, f"{flag_of(name)} is {value}, expected a multiple of --cycle, {self.cycle}")
 
 
 class Update(NamedTuple):
