@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from mbdpg import envs
-from mbdpg.agents import mbdpg, td3
+from mbdpg.agents import mbdpg
 from mbdpg.experiments import run
-from mbdpg.experiments.config import RunConfig
+from mbdpg.experiments.config import AgentConfig, RunConfig, algorithm_of
 from mbdpg.interfaces import Environment
 from mbdpg.networks.policy import NumpyPolicy
 from mbdpg.training.evaluation import Evaluation, evaluate as run_episodes
@@ -23,7 +23,7 @@ Env = str | envs.MakeGymnasium
 def train(
     env: Env,
     *,
-    config: mbdpg.Config | td3.Config | None = None,
+    config: AgentConfig | None = None,
     schedule: Schedule | None = None,
     seeds: Sequence[int] = (0,),
     out: str | Path,
@@ -50,7 +50,7 @@ def train(
     agent = mbdpg.Config() if config is None else config
     settings = RunConfig(
         env=env if isinstance(env, str) else _name(env) or "environment made in code",
-        algorithm="td3" if isinstance(agent, td3.Config) else "mbdpg",
+        algorithm=algorithm_of(agent),
         agent=agent,
         schedule=schedule or Schedule(),
         demonstrations=None if demonstrations is None else str(demonstrations),

@@ -41,8 +41,10 @@ def flag_of(setting: str) -> str:
     return "--" + setting.replace("_", "-")
 
 
-def require_settings(config: Any, *, positive: Sequence[str] = (), at_most: Mapping[str, float] = {}) -> None:
-    """Check a config's choices and numbers: `positive` ones, those from 0 to a bound, and all others at least 0."""
+def require_settings(
+    config: Any, *, positive: Sequence[str] = (), at_most: Mapping[str, float] = {}, signed: Sequence[str] = ()
+) -> None:
+    """Check a config's choices, and its numbers: above 0, from 0 to a bound, finite, or else at least 0."""
     kinds = get_type_hints(type(config))
     for field in dataclasses.fields(config):
         value, kind = getattr(config, field.name), kinds[field.name]
@@ -52,11 +54,13 @@ def require_settings(config: Any, *, positive: Sequence[str] = (), at_most: Mapp
             require(value in choices, f"{flag} is {value!r}, expected one of {', '.join(map(str, choices))}")
             continue
         wanted = (int, float) if kind is float else kind
-        fits = isinstance(value, wanted) and not isinstance(value, bool)
+        fits = isinstance(value, wanted) and isinstance(value, bool) == (kind is bool)
         require(fits, f"{flag} is {value!r}, expected {kind.__name__}")
         if field.name in at_most:
             bound = at_most[field.name]
             require(0.0 <= value <= bound, f"{flag} is {value}, expected a number from 0 to {bound:g}")
+        elif field.name in signed:
+            require(math.isfinite(value), f"{flag} is {value}, expected a finite number")
         elif field.name in positive:
             require(0.0 < value < math.inf, f"{flag} is {value}, expected a number above 0")
         else:

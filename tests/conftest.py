@@ -51,6 +51,7 @@ EVERY_100 = ("--evaluate-every", "100", "--evaluation-episodes", "1", "--log-eve
 SMALL = ("--width", "8", "--batch-size", "8", "--random-steps", "100", *EVERY_100)
 FLAGS = {
     "td3": ("--algorithm", "td3", *SMALL),
+    "sac": ("--algorithm", "sac", *SMALL),
     "mbdpg": (
         *("--algorithm", "mbdpg", *SMALL, "--memory", "8", "--gaussians", "2", "--horizon", "2", "--burn-in", "2"),
         *("--fit-length", "2", "--fit-batch-size", "8", "--pretraining-fits", "10"),

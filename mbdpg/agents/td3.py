@@ -46,13 +46,17 @@ class Config:
     """Every episode's spread is drawn uniformly from within this share of its mean, from none to twice as much at 1."""
     random_steps: int = 4000
     """Environment steps with uniformly random actions before learning starts."""
+    layers: int = 3
+    """Dense layers of every network."""
     width: int = 256
-    """Width of each of the three dense layers of every network."""
+    """Width of each."""
+    plain: bool = False
+    """Networks of ReLU without LayerNorm, on observations and rewards as they are."""
 
     def __post_init__(self) -> None:
         require_settings(
             self,
-            positive=("batch_size", "updates_per_step", "policy_delay", "learning_rate", "width"),
+            positive=("batch_size", "updates_per_step", "policy_delay", "learning_rate", "layers", "width"),
             at_most={"discount": 1, "target_update_rate": 1, "exploration_scatter": 1, "exploration_color": 2},
         )
 
@@ -87,9 +91,11 @@ class TD3:
 
     def init(self, *, key: PRNGKeyArray) -> State:
         """Fresh networks; targets equal to what they follow."""
-        o, a, widths = self.env.observation_size, self.env.action_size, (self.config.width,) * 3
+        c, o, a = self.config, self.env.observation_size, self.env.action_size
+        widths = (c.width,) * c.layers
         actor_key, critic_key = jax.random.split(key)
-        actor, critics = Policy(o, a, widths, key=actor_key), Critics(o, a, widths, key=critic_key)
+        actor = Policy(o, a, widths, plain=c.plain, key=actor_key)
+        critics = Critics(o, a, widths, plain=c.plain, key=critic_key)
         return State(
             actor=actor,
             critics=critics,
@@ -104,6 +110,8 @@ class TD3:
 
     def prepare(self, state: State, statistics: Statistics) -> State:
         """Take over the replay's scales."""
+        if self.config.plain:
+            return state
         normalizer = Normalizer(statistics.observation_mean, statistics.observation_std)
         return eqx.tree_at(lambda x: (x.normalizer, x.return_scale), state, (normalizer, statistics.return_scale))
 

@@ -40,7 +40,7 @@ class RunOptions:
     algorithm: Algorithm = "mbdpg"
     """Algorithm to train."""
     preset: presets.Preset = "default"
-    """Settings that measured best, or those of the paper; other flags change single ones."""
+    """Settings that measured best, or those published; other flags change single ones."""
     seeds: tuple[int, ...] = (0,)
     """Random seeds; each is a run of its own, all in this process."""
     out: Path | None = None

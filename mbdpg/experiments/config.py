@@ -9,13 +9,25 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from mbdpg import envs
-from mbdpg.agents import mbdpg, td3
+from mbdpg.agents import mbdpg, sac, td3
 from mbdpg.interfaces import require
 from mbdpg.training.loop import Schedule
 
-Algorithm = Literal["mbdpg", "td3"]
+Algorithm = Literal["mbdpg", "td3", "sac"]
+AgentConfig = mbdpg.Config | td3.Config | sac.Config
 
-CONFIGS: dict[str, type[mbdpg.Config] | type[td3.Config]] = {"mbdpg": mbdpg.Config, "td3": td3.Config}
+CONFIGS: dict[str, type[AgentConfig]] = {"mbdpg": mbdpg.Config, "td3": td3.Config, "sac": sac.Config}
+
+
+def algorithm_of(agent: AgentConfig) -> Algorithm:
+    """The name of the algorithm that these are settings of."""
+    match agent:
+        case mbdpg.Config():
+            return "mbdpg"
+        case td3.Config():
+            return "td3"
+        case sac.Config():
+            return "sac"
 
 
 @dataclass(frozen=True)
@@ -43,7 +55,7 @@ class RunConfig:
     env: str
     """Gymnasium id, or a name for an environment made in code."""
     algorithm: Algorithm = "mbdpg"
-    agent: mbdpg.Config | td3.Config = field(default_factory=mbdpg.Config)
+    agent: AgentConfig = field(default_factory=mbdpg.Config)
     schedule: Schedule = field(default_factory=Schedule)
     env_options: EnvOptions = field(default_factory=EnvOptions)
     demonstrations: str | None = None

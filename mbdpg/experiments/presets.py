@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from mbdpg.agents import mbdpg, td3
-from mbdpg.experiments.config import CONFIGS, EnvOptions
+from mbdpg.experiments.config import CONFIGS, AgentConfig, EnvOptions
 from mbdpg.interfaces import require
 from mbdpg.training.loop import Schedule
 
@@ -41,7 +40,9 @@ PAPER: dict[str, dict[str, Any]] = {
         "gaussians": 5,
         "width": 256,
     },
-    "td3": {},
+    # The authors' own code: sfujim/TD3 and rail-berkeley/softlearning.
+    "td3": {"layers": 2, "plain": True, "random_steps": 25_000},
+    "sac": {"layers": 2, "plain": True, "random_steps": 1000},
 }
 
 PAPER_STEPS = 200_000
@@ -49,7 +50,7 @@ PAPER_EPISODE_LIMIT = 1000
 """Section 5.1 cuts every episode, in training and test, at 1,000 steps."""
 
 
-def agent_config(algorithm: str, preset: str) -> mbdpg.Config | td3.Config:
+def agent_config(algorithm: str, preset: str) -> AgentConfig:
     """The algorithm's settings under a preset."""
     require(algorithm in CONFIGS, f"unknown --algorithm {algorithm!r}; expected one of {', '.join(CONFIGS)}")
     require(preset in ("default", "paper"), f"unknown --preset {preset!r}; expected default or paper")

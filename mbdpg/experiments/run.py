@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from mbdpg.agents import mbdpg, td3
+from mbdpg.agents import mbdpg, sac, td3
 from mbdpg.experiments.config import RunConfig
 from mbdpg.imitation.demonstrations import Demonstrations
 from mbdpg.interfaces import Agent, Environment, EnvSpec, Metrics, UserError, require
@@ -192,7 +192,13 @@ class _Recorder:
 
 def make_agent(config: RunConfig, spec: EnvSpec) -> Agent:
     """The agent that the config's type names."""
-    return mbdpg.MBDPG(config.agent, spec) if isinstance(config.agent, mbdpg.Config) else td3.TD3(config.agent, spec)
+    match config.agent:
+        case mbdpg.Config():
+            return mbdpg.MBDPG(config.agent, spec)
+        case td3.Config():
+            return td3.TD3(config.agent, spec)
+        case sac.Config():
+            return sac.SAC(config.agent, spec)
 
 
 def _compose(

@@ -17,9 +17,18 @@ class Critics(eqx.Module):
 
     mlps: MLP
 
-    def __init__(self, observation: int, action: int, widths: Sequence[int], *, count: int = 2, key: PRNGKeyArray):
+    def __init__(
+        self,
+        observation: int,
+        action: int,
+        widths: Sequence[int],
+        *,
+        count: int = 2,
+        plain: bool = False,
+        key: PRNGKeyArray,
+    ):
         def one(key: PRNGKeyArray) -> MLP:
-            return MLP(observation + action, widths, 1, output_scale=0.0, key=key)
+            return MLP(observation + action, widths, 1, output_scale=0.0, plain=plain, key=key)
 
         self.mlps = eqx.filter_vmap(one)(jax.random.split(key, count))
 

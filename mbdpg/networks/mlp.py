@@ -58,20 +58,28 @@ class LayerNorm(eqx.Module):
 
 
 class MLP(eqx.Module):
-    """Hidden layers of Linear, LayerNorm and ELU, then a Linear output."""
+    """Hidden layers of Linear, LayerNorm and ELU, or of Linear and ReLU alone; then a Linear output."""
 
     hidden: tuple[Linear, ...]
     norms: tuple[LayerNorm, ...]
+    """None of them in a plain network."""
     output: Linear
 
     def __init__(
-        self, inputs: int, widths: Sequence[int], outputs: int, *, output_scale: float = 1.0, key: PRNGKeyArray
+        self,
+        inputs: int,
+        widths: Sequence[int],
+        outputs: int,
+        *,
+        output_scale: float = 1.0,
+        plain: bool = False,
+        key: PRNGKeyArray,
     ):
-        """Build the layers; `output_scale` 0 makes the network start as the constant zero."""
+        """Build the layers; `output_scale` 0 makes the network start as the constant zero, `plain` is with ReLU."""
         sizes = [inputs, *widths]
         keys = jax.random.split(key, len(sizes))
         self.hidden = tuple(Linear(a, b, key=k) for a, b, k in zip(sizes, widths, keys[:-1], strict=False))
-        self.norms = tuple(LayerNorm(width) for width in widths)
+        self.norms = () if plain else tuple(LayerNorm(width) for width in widths)
         self.output = Linear(sizes[-1], outputs, scale=output_scale, key=keys[-1])
 
     def __call__(self, x: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
@@ -79,6 +87,10 @@ class MLP(eqx.Module):
 
     def features(self, x: Float[Array, "*batch inputs"]) -> Float[Array, "*batch width"]:
         """The last hidden layer's activations."""
+        if not self.norms:
+            for linear in self.hidden:
+                x = jax.nn.relu(linear(x))
+            return x
         for linear, norm in zip(self.hidden, self.norms, strict=True):
             x = elu(norm(linear(x)))
         return x

@@ -11,7 +11,7 @@ import numpy as np
 
 from mbdpg.interfaces import Agent, Batch, Metrics, Phase, Statistics, UserError
 from mbdpg.networks.normalizer import Normalizer
-from mbdpg.networks.policy import NumpyPolicy, Policy, policy_arrays
+from mbdpg.networks.policy import GaussianPolicy, NumpyPolicy, Policy, policy_arrays
 
 
 class Learner:
@@ -55,7 +55,7 @@ class Learner:
         policy, normalizer, std = jax.vmap(self.agent.behavior)(self.state)
         return self._on_host(policy, normalizer), np.asarray(std)
 
-    def _on_host(self, policy: Policy, normalizer: Normalizer) -> list[NumpyPolicy]:
+    def _on_host(self, policy: Policy | GaussianPolicy, normalizer: Normalizer) -> list[NumpyPolicy]:
         pair = jax.device_get((policy, normalizer))
         return [NumpyPolicy(policy_arrays(*jax.tree.map(lambda x, i=i: x[i], pair))) for i in range(len(self._keys))]
 

@@ -164,7 +164,7 @@ class Training:
     def _collect(self, policies: Sequence[NumpyPolicy], stds: np.ndarray) -> None:
         began = time.monotonic()
         for collector, policy, std in zip(self.collectors, policies, stds, strict=True):
-            collector.collect(policy, float(std), self.schedule.cycle)
+            collector.collect(policy.explore, float(std), self.schedule.cycle)
         self.env_steps += self.schedule.cycle
         self._seconds["acting"] += time.monotonic() - began
 

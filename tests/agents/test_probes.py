@@ -12,18 +12,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mbdpg.agents import mbdpg, td3
+from mbdpg.agents import mbdpg, sac, td3
 from mbdpg.dynamics import mixture
 from mbdpg.interfaces import Agent, Batch, EnvSpec
 
 ROWS, STEPS, BATCH, UPDATES, GAMMA = 512, 3, 32, 800, 0.5
 ENV = EnvSpec("probe", observation_size=1, action_size=1, episode_limit=None, reference_return=None)
-NETWORKS = {"width": 16, "target_noise": 0.0, "batch_size": BATCH, "discount": GAMMA, "target_update_rate": 0.1}
+NETWORKS = {"width": 16, "batch_size": BATCH, "discount": GAMMA, "target_update_rate": 0.1}
 AGENTS: dict[str, Agent] = {
-    "td3": td3.TD3(td3.Config(**NETWORKS, learning_rate=3e-3), ENV),
+    "td3": td3.TD3(td3.Config(**NETWORKS, learning_rate=3e-3, target_noise=0.0), ENV),
+    "sac": sac.SAC(sac.Config(**NETWORKS, learning_rate=3e-3, entropy_per_action=-9.0, initial_temperature=1e-3), ENV),
     "mbdpg": mbdpg.MBDPG(
         mbdpg.Config(
             **NETWORKS,
+            target_noise=0.0,
             **{f"{name}_learning_rate": 3e-3 for name in ("actor", "critic", "dynamics")},
             # Imagination sees memories of up to three steps, and so must fitting.
             **{"horizon": 2, "burn_in": 0, "fit_length": 3, "fit_batch_size": BATCH, "memory": 8, "gaussians": 2},
@@ -83,7 +85,7 @@ def learn(request: pytest.FixtureRequest) -> Callable[[Probe, list[float]], Lear
             state = train(experience(probe, starts), jax.random.key(0))
         return Learned(
             value=lambda observation, action: float(jnp.min(state.critics(one(observation), one(action)))),
-            action=lambda observation: float(state.actor(one(observation))[0]),
+            action=lambda observation: float(agent.policy(state)[0](one(observation))[0]),
         )
 
     return learned

@@ -7,7 +7,7 @@ import dataclasses
 import jax
 import pytest
 
-from mbdpg.agents import mbdpg, td3
+from mbdpg.agents import mbdpg, sac, td3
 from mbdpg.experiments.config import CONFIGS, RunConfig
 from mbdpg.experiments.presets import PAPER, agent_config, run_settings
 from mbdpg.interfaces import EnvSpec, UserError
@@ -68,9 +68,21 @@ def test_networks_have_the_paper_s_three_layers() -> None:
 
 def test_the_default_preset_is_the_configs_own_defaults() -> None:
     assert agent_config("mbdpg", "default") == mbdpg.Config()
-    assert agent_config("td3", "default") == agent_config("td3", "paper") == td3.Config()
+    assert agent_config("td3", "default") == td3.Config() and agent_config("sac", "default") == sac.Config()
     schedule, options = run_settings("default")
     assert schedule == Schedule() and options == RunConfig("Pendulum-v1").env_options
+
+
+def test_the_rivals_have_their_authors_networks_and_settings() -> None:
+    # Haarnoja et al. 2018b, Table 1; Fujimoto et al. 2018, as in their code since 2020.
+    shared = {"layers": 2, "width": 256, "plain": True, "batch_size": 256, "learning_rate": 3e-4, "discount": 0.99}
+    shared |= {"target_update_rate": 0.005, "updates_per_step": 1, "exploration_scatter": 0, "exploration_color": 0}
+    own = {"td3": {"exploration_std": 0.1, "target_noise": 0.2, "target_noise_clip": 0.5, "policy_delay": 2}}
+    own |= {"sac": {"entropy_per_action": -1}}
+    for algorithm in ("td3", "sac"):
+        config = agent_config(algorithm, "paper")
+        expected = shared | own[algorithm]
+        assert {name: getattr(config, name) for name in expected} == expected
 
 
 @pytest.mark.parametrize("algorithm", CONFIGS)
@@ -79,7 +91,7 @@ def test_a_preset_names_nothing_that_the_config_does_not_have(algorithm: str) ->
 
 
 def test_unknown_names_are_refused_with_the_known_ones() -> None:
-    with pytest.raises(UserError, match="unknown --algorithm 'ppo'; expected one of mbdpg, td3"):
+    with pytest.raises(UserError, match="unknown --algorithm 'ppo'; expected one of mbdpg, td3, sac"):
         agent_config("ppo", "default")
     with pytest.raises(UserError, match="unknown --preset 'big'; expected default or paper"):
         agent_config("mbdpg", "big")

@@ -43,6 +43,18 @@ def test_a_network_is_the_same_function_at_every_rank(key: jax.Array, lead: tupl
     np.testing.assert_allclose(mlp(jnp.asarray(x)), numpy_mlp(mlp, x), rtol=2e-4, atol=2e-4)
 
 
+def test_a_plain_network_has_relus_and_no_norms(key: jax.Array) -> None:
+    rng = np.random.default_rng(0)
+    mlp = shaken(MLP(3, (8, 6), 2, plain=True, key=key), rng)
+    x = rng.normal(size=(5, 3)).astype(np.float32)
+    expected = x
+    for linear in mlp.hidden:
+        expected = np.maximum(expected @ np.asarray(linear.weight) + np.asarray(linear.bias), 0)
+    expected = expected @ np.asarray(mlp.output.weight) + np.asarray(mlp.output.bias)
+    np.testing.assert_allclose(mlp(jnp.asarray(x)), expected, rtol=2e-4)
+    assert not mlp.norms
+
+
 def test_without_hidden_layers_a_network_is_affine(key: jax.Array) -> None:
     mlp = shaken(MLP(3, (), 2, key=key), np.random.default_rng(1))
     x = jnp.asarray([[1.0, -2.0, 0.5]])

@@ -1,30 +1,40 @@
-"""The policy, and that what acts (NumPy) is what was learned (JAX)."""
+"""The policies, and that what acts (NumPy) is what was learned (JAX)."""
 
+from typing import Any
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from mbdpg.networks.normalizer import Normalizer
-from mbdpg.networks.policy import NumpyPolicy, Policy, policy_arrays
+from mbdpg.networks.policy import GaussianPolicy, NumpyPolicy, Policy, policy_arrays
 
 
-def learned(key: jax.Array, widths: tuple[int, ...]) -> tuple[Policy, Normalizer]:
-    """A policy with all parameters away from where they start."""
+def shaken(policy: Any) -> Any:
+    """The policy with all parameters away from where they start."""
     rng = np.random.default_rng(0)
-    policy = jax.tree.map(
-        lambda x: jnp.asarray(rng.normal(0.2, 0.7, x.shape), jnp.float32), Policy(3, 2, widths, key=key)
-    )
+    return jax.tree.map(lambda x: jnp.asarray(rng.normal(0.2, 0.7, x.shape), jnp.float32), policy)
+
+
+def learned(key: jax.Array, widths: tuple[int, ...], *, plain: bool = False) -> tuple[Policy, Normalizer]:
+    policy = shaken(Policy(3, 2, widths, plain=plain, key=key))
     return policy, Normalizer(jnp.asarray([1.0, -2.0, 0.0]), jnp.asarray([0.5, 3.0, 1.0]))
+
+
+def gaussian(key: jax.Array, *, plain: bool = False) -> GaussianPolicy:
+    return shaken(GaussianPolicy(3, 2, (8, 6), plain=plain, key=key))
 
 
 def arrays(key: jax.Array) -> dict[str, np.ndarray]:
     return policy_arrays(*learned(key, (8, 6)))
 
 
+@pytest.mark.parametrize("plain", [False, True])
 @pytest.mark.parametrize("widths", [(), (8,), (8, 6, 8)])
-def test_the_numpy_policy_acts_as_the_jax_policy(key: jax.Array, widths: tuple[int, ...]) -> None:
-    policy, normalizer = learned(key, widths)
+def test_the_numpy_policy_acts_as_the_jax_policy(key: jax.Array, widths: tuple[int, ...], plain: bool) -> None:
+    policy, normalizer = learned(key, widths, plain=plain)
     acting = NumpyPolicy(policy_arrays(policy, normalizer))
     rng = np.random.default_rng(1)
     observations = (rng.normal(size=(50, 3)) * 10.0 ** rng.uniform(-2, 3, (50, 1))).astype(np.float32)
@@ -33,6 +43,49 @@ def test_the_numpy_policy_acts_as_the_jax_policy(key: jax.Array, widths: tuple[i
     assert actions.dtype == np.float32 and actions.shape == (50, 2)
     np.testing.assert_allclose(actions, expected, atol=1e-5)
     assert (acting.observation_size, acting.action_size) == (3, 2)
+
+
+def test_a_deterministic_policy_explores_by_adding_noise_within_the_bounds(key: jax.Array) -> None:
+    acting, observation = NumpyPolicy(arrays(key)), np.float32([1, 2, 3])
+    noise = np.array([0.01, 5.0])
+    expected = np.clip(acting(observation) + noise, -1, 1)
+    np.testing.assert_allclose(acting.explore(observation, noise), expected, rtol=1e-6)
+    assert acting.explore(observation, noise).dtype == np.float32
+
+
+@pytest.mark.parametrize("plain", [False, True])
+def test_a_gaussian_policy_explores_with_its_own_spread_before_the_tanh(key: jax.Array, plain: bool) -> None:
+    policy, (_, normalizer) = gaussian(key, plain=plain), learned(key, ())
+    acting, rng = NumpyPolicy(policy_arrays(policy, normalizer)), np.random.default_rng(1)
+    for observation, noise in zip(rng.normal(size=(20, 3)), rng.normal(size=(20, 2)), strict=True):
+        seen = normalizer(jnp.asarray(observation, jnp.float32))
+        features = policy.center.mlp.features(seen)
+        log_std = np.clip(policy.spread(features), -20, 2)
+        expected = np.tanh(policy.center.mlp.output(features) + np.exp(log_std) * noise)
+        found = acting.explore(observation, noise)
+        np.testing.assert_allclose(found, expected, atol=2e-5)
+        assert found.dtype == np.float32
+        np.testing.assert_allclose(acting(observation), policy.center(seen), atol=2e-5)
+
+
+def test_a_gaussian_policy_s_log_density_is_that_of_its_samples(key: jax.Array) -> None:
+    policy = GaussianPolicy(3, 1, (8, 6), key=key)  # a fresh one is not saturated
+    observation = jnp.ones((200_000, 3))
+    actions, log_density = policy.sample(observation, key=key)
+    counts, edges = np.histogram(actions[:, 0], bins=np.linspace(-1, 1, 21))
+    which = np.digitize(actions[:, 0], edges) - 1
+    for inside in (5, 10, 14):
+        density = np.exp(log_density[which == inside]).mean()
+        assert density == pytest.approx(counts[inside] / len(actions) / 0.1, rel=0.05)
+
+
+def test_a_saturated_action_has_a_finite_log_density_and_gradient(key: jax.Array) -> None:
+    policy = GaussianPolicy(3, 2, (8,), key=key)
+    policy = eqx.tree_at(lambda p: p.center.mlp.output.bias, policy, jnp.asarray([40.0, -40.0]))
+    action, log_density = policy.sample(jnp.ones((4, 3)), key=key)
+    assert jnp.abs(action).max() == 1 and jnp.isfinite(log_density).all()
+    gradient = jax.grad(lambda p: jnp.sum(p.sample(jnp.ones((4, 3)), key=key)[1]))(policy)
+    assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
 
 
 def test_acting_leaves_the_observation_and_the_parameters_as_they_were(key: jax.Array) -> None:
@@ -67,6 +120,21 @@ def test_a_missing_array_is_refused(key: jax.Array, missing: str) -> None:
     del given[missing]
     with pytest.raises(ValueError, match="policy"):
         NumpyPolicy(given)
+
+
+@pytest.mark.parametrize("missing", ["spread/weight", "spread/bias"])
+def test_half_a_spread_is_refused(key: jax.Array, missing: str) -> None:
+    given = policy_arrays(gaussian(key), learned(key, ())[1])
+    del given[missing]
+    with pytest.raises(ValueError, match="policy"):
+        NumpyPolicy(given)
+
+
+@pytest.mark.parametrize(("name", "shape"), [("weight", (6, 1)), ("weight", (8, 2)), ("bias", (1,)), ("bias", ())])
+def test_a_spread_of_another_shape_than_the_output_is_refused(key: jax.Array, name: str, shape: tuple) -> None:
+    given = policy_arrays(gaussian(key), learned(key, ())[1])
+    with pytest.raises(ValueError, match="spread"):
+        NumpyPolicy(given | {f"spread/{name}": np.ones(shape, np.float32)})
 
 
 @pytest.mark.parametrize("name", ["mean", "std", "hidden/0/weight", "hidden/1/offset", "output/bias"])

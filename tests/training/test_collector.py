@@ -85,6 +85,14 @@ def policy(observation: np.ndarray) -> np.ndarray:
     return np.tanh(observation[:1])
 
 
+def explore(observation: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    return np.clip(policy(observation) + noise, -1, 1).astype(np.float32)
+
+
+def noise_alone(observation: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    return np.clip(noise, -1, 1).astype(np.float32)
+
+
 def collector(world: World, *, seed: int = 3, random_steps: int = 10, scatter: float = 1.0) -> Collector:
     return Collector(world.make, seed, Replay(2, 1), random_steps=random_steps, color=1.0, scatter=scatter)
 
@@ -104,30 +112,30 @@ def failing_at(*moments: int, error: Exception | None = None) -> Fault:
 def test_the_first_steps_are_uniform_and_know_no_policy() -> None:
     world, asked = World(), []
     made = collector(world, random_steps=2000)
-    made.collect(lambda observation: asked.append(1) or policy(observation), 0.3, 2000)
+    made.collect(lambda *given: asked.append(1) or explore(*given), 0.3, 2000)
     actions = np.concatenate(world.actions)
     assert actions.dtype == np.float32
     assert np.abs(actions).max() <= 1
     assert abs(actions.mean()) < 0.04 and abs(actions.std() - np.sqrt(1 / 3)) < 0.03
     assert not asked
-    made.collect(lambda observation: asked.append(1) or policy(observation), 0.3, 1)
+    made.collect(lambda *given: asked.append(1) or explore(*given), 0.3, 1)
     assert asked
 
 
 def test_after_them_the_policy_acts_with_noise_of_the_given_size_inside_the_bounds() -> None:
     world = World()
     made = collector(world, random_steps=0, scatter=0.0)
-    made.collect(lambda observation: np.zeros(1, np.float32), 0.3, 2000)
+    made.collect(noise_alone, 0.3, 2000)
     actions = np.concatenate(world.actions)
     assert abs(actions.mean()) < 0.03 and abs(actions.std() - 0.3) < 0.03
-    made.collect(lambda observation: np.ones(1, np.float32), 5.0, 200)
+    made.collect(explore, 5.0, 200)
     assert np.abs(np.concatenate(world.actions)).max() == 1
 
 
 def test_where_noise_is_scattered_some_episodes_have_little_and_others_much() -> None:
     world = World()
     made = collector(world, random_steps=0)
-    made.collect(lambda observation: np.zeros(1, np.float32), 0.3, 4000)
+    made.collect(noise_alone, 0.3, 4000)
     actions = np.concatenate(world.actions)
     columns = made.replay.columns()
     spreads = np.array([actions[columns["start"] == start].std() for start in np.unique(columns["start"])])
@@ -138,7 +146,7 @@ def test_where_noise_is_scattered_some_episodes_have_little_and_others_much() ->
 def test_without_noise_the_action_is_the_policy_s() -> None:
     world = World()
     made = collector(world, random_steps=0)
-    made.collect(policy, 0.0, 20)
+    made.collect(explore, 0.0, 20)
     columns = made.replay.columns()
     np.testing.assert_array_equal(columns["action"], [policy(observation) for observation in columns["observation"]])
 
@@ -148,7 +156,7 @@ def test_noise_is_a_function_of_seed_step_and_episode_alone() -> None:
         world = World()
         made = collector(world, seed=seed, random_steps=4)
         for piece in pieces:
-            made.collect(lambda observation: np.zeros(1, np.float32), 0.1, piece)
+            made.collect(noise_alone, 0.1, piece)
         return np.concatenate(world.actions)
 
     np.testing.assert_array_equal(noise(3, [12]), noise(3, [1, 4, 7]))
@@ -159,7 +167,7 @@ def test_noise_is_a_function_of_seed_step_and_episode_alone() -> None:
 def test_terminated_and_truncated_are_stored_apart_and_no_transition_crosses_a_reset() -> None:
     world = World()
     made = collector(world)
-    made.collect(policy, 0.1, 200)
+    made.collect(explore, 0.1, 200)
     columns = made.replay.columns()
     assert columns["terminated"].sum() > 5 and columns["truncated"].sum() > 5
     assert not (columns["terminated"] & columns["truncated"]).any()
@@ -175,7 +183,7 @@ def test_terminated_and_truncated_are_stored_apart_and_no_transition_crosses_a_r
 def test_each_episode_has_its_own_seed_from_that_of_the_run() -> None:
     world = World()
     made = collector(world, seed=7)
-    made.collect(policy, 0.1, 100)
+    made.collect(explore, 0.1, 100)
     assert world.seeds == [episode_seed(7, "train", episode) for episode in range(len(world.seeds))]
     assert len(world.seeds) > 10
     assert made.episode in (len(world.seeds) - 1, len(world.seeds))
@@ -183,7 +191,7 @@ def test_each_episode_has_its_own_seed_from_that_of_the_run() -> None:
 
 def test_returns_are_the_sums_of_the_recorded_rewards() -> None:
     made = collector(World())
-    made.collect(policy, 0.1, 100)
+    made.collect(explore, 0.1, 100)
     columns = made.replay.columns()
     ends = np.flatnonzero(columns["terminated"] | columns["truncated"]) + 1
     sums = [part.sum(dtype=np.float64) for part in np.split(columns["reward"], ends)[:-1]]
@@ -194,7 +202,7 @@ def test_returns_are_the_sums_of_the_recorded_rewards() -> None:
 def test_progress_goes_from_random_returns_to_the_reference() -> None:
     made = collector(World())
     assert made.progress(10.0) == 0
-    made.collect(policy, 0.1, 10)
+    made.collect(explore, 0.1, 10)
     assert made.baseline == np.mean(made.returns)
     made.returns = [made.baseline + (10.0 - made.baseline) / 4] * 10
     assert made.progress(10.0) == pytest.approx(0.25)
@@ -213,9 +221,9 @@ def test_a_fault_drops_its_step_closes_the_episode_is_counted_and_rebuilds(
 ) -> None:
     world, whole = World(failing_at(13, error=error)), World()
     made, healthy = collector(world), collector(whole)
-    healthy.collect(policy, 0.1, 13)
+    healthy.collect(explore, 0.1, 13)
     assert healthy.replay.episode_open
-    made.collect(policy, 0.1, 40)
+    made.collect(explore, 0.1, 40)
     assert (made.env_steps, made.replay.size, made.faults) == (40, 40, 1)
     assert (world.made, world.closed) == (2, 1)
     columns = made.replay.columns()
@@ -234,7 +242,7 @@ def test_a_fault_of_a_reset_loses_that_episode_alone() -> None:
     resets = iter([False, True, False, False])
     world = World(lambda moment: failing_at(-1)(-1) if moment == -1 and next(resets, False) else None)
     made = collector(world)
-    made.collect(policy, 0.1, 30)
+    made.collect(explore, 0.1, 30)
     assert (made.env_steps, made.faults, world.made) == (30, 1, 2)
     assert made.replay.columns()["truncated"].sum() + made.replay.columns()["terminated"].sum() == len(made.returns)
 
@@ -243,20 +251,20 @@ def test_an_environment_that_always_fails_ends_the_run_with_advice() -> None:
     world = World(failing_at(*range(5, 1000)))
     made = collector(world)
     with pytest.raises(UserError, match="Walk-v0 failed 10 times in a row .*; mend the environment") as caught:
-        made.collect(policy, 0.1, 40)
+        made.collect(explore, 0.1, 40)
     assert "\n" not in str(caught.value)
     assert made.env_steps == 5 and made.faults == FAULTS_IN_A_ROW
 
 
 def test_faults_with_steps_between_them_do_not_end_the_run() -> None:
     made = collector(World(failing_at(*range(5, 1000, 3))))
-    made.collect(policy, 0.1, 100)
+    made.collect(explore, 0.1, 100)
     assert made.env_steps == 100 and made.faults > 3 * FAULTS_IN_A_ROW
 
 
 def test_an_environment_that_cannot_even_be_closed_is_replaced() -> None:
     made = collector(World(failing_at(13, -2, error=EOFError("worker died"))))
-    made.collect(policy, 0.1, 40)
+    made.collect(explore, 0.1, 40)
     assert (made.env_steps, made.faults) == (40, 1)
 
 
@@ -269,20 +277,20 @@ def test_an_environment_that_cannot_be_made_again_at_once_is_tried_again() -> No
         return world.make()
 
     made = Collector(make, 3, Replay(2, 1), random_steps=10, color=1.0, scatter=1.0)
-    made.collect(policy, 0.1, 40)
+    made.collect(explore, 0.1, 40)
     assert (made.env_steps, made.faults) == (40, 3)
 
 
 def test_a_mistake_that_the_user_can_mend_is_no_fault() -> None:
     made = collector(World(failing_at(4, error=UserError("returned an observation of shape (3,)"))))
     with pytest.raises(UserError, match="of shape"):
-        made.collect(policy, 0.1, 40)
+        made.collect(explore, 0.1, 40)
     assert made.faults == 0
 
 
 def cycles(made: Collector, count: int) -> Collector:
     for _ in range(count):
-        made.collect(policy, 0.1, 1)
+        made.collect(explore, 0.1, 1)
     return made
 
 
@@ -290,7 +298,7 @@ def test_noise_is_correlated_over_its_whole_block_and_the_next_block_is_another(
     world = World()
     made = collector(world, random_steps=0, scatter=0.0)
     made.env_steps = NOISE_BLOCK - 6
-    made.collect(lambda observation: np.zeros(1, np.float32), 0.1, 12)
+    made.collect(noise_alone, 0.1, 12)
     expected = np.concatenate([noise_block(3, 0, 1, 1.0)[-6:], noise_block(3, 1, 1, 1.0)[:6]])
     np.testing.assert_allclose(np.concatenate(world.actions), 0.1 * expected[:, 0], rtol=1e-6)
 
@@ -316,10 +324,10 @@ def test_an_environment_that_does_not_repeat_itself_is_said_loudly_and_loses_tha
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     first, steps = collector(World()), 12
-    first.collect(policy, 0.1, steps)
+    first.collect(explore, 0.1, steps)
     while not first.replay.episode_open:
         steps += 1
-        first.collect(policy, 0.1, 1)
+        first.collect(explore, 0.1, 1)
     world = World()
     world.drift = 1e-6
     second = Collector(
@@ -331,7 +339,7 @@ def test_an_environment_that_does_not_repeat_itself_is_said_loudly_and_loses_tha
     assert said.count("\n") == 1
     assert second.replay.columns()["truncated"][-1] and not second.replay.episode_open
     assert second.episode == first.episode + 1
-    second.collect(policy, 0.1, 30)
+    second.collect(explore, 0.1, 30)
     assert second.replay.columns()["start"][steps] == steps
     assert world.seeds[1] == episode_seed(3, "train", first.episode + 1)
 
@@ -341,9 +349,9 @@ def test_an_environment_that_fails_while_its_episode_is_played_again_does_not_en
     moment: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
     first = collector(World())
-    first.collect(policy, 0.1, 12)
+    first.collect(explore, 0.1, 12)
     while not first.replay.episode_open:
-        first.collect(policy, 0.1, 1)
+        first.collect(explore, 0.1, 1)
     world = World(failing_at(moment))
     second = Collector(
         world.make, 3, Replay.from_columns(first.replay.columns()), random_steps=10, color=1.0, scatter=1.0
@@ -351,6 +359,6 @@ def test_an_environment_that_fails_while_its_episode_is_played_again_does_not_en
     second.restore(first.facts())
     assert "this resume is not exact" in capsys.readouterr().err
     world.fault = no_fault
-    second.collect(policy, 0.1, 30)
+    second.collect(explore, 0.1, 30)
     assert second.env_steps == first.env_steps + 30
     assert world.made == 2

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 
-from mbdpg.agents import mbdpg, td3
+from mbdpg.agents import mbdpg, sac, td3
 from mbdpg.interfaces import Agent, Batch, EnvSpec, UserError
 from mbdpg.training.learner import Learner
 from mbdpg.training.replay import Replay
@@ -20,6 +20,10 @@ TINY = {"width": 4, "batch_size": 3}
 
 def make_td3(**settings: Any) -> Agent:
     return td3.TD3(td3.Config(**(TINY | settings)), SPEC)
+
+
+def make_sac(**settings: Any) -> Agent:
+    return sac.SAC(sac.Config(**(TINY | settings)), SPEC)
 
 
 def make_mbdpg(**settings: Any) -> Agent:
@@ -71,11 +75,10 @@ class Two(NamedTuple):
     metrics_alone: list[dict[str, np.ndarray]]
 
 
-@pytest.fixture(scope="module", params=["toy", "td3", pytest.param("mbdpg", marks=pytest.mark.slow)])
+@pytest.fixture(scope="module", params=["toy", "td3", "sac", pytest.param("mbdpg", marks=pytest.mark.slow)])
 def two(request: pytest.FixtureRequest, toy: Any) -> Two:
-    def make() -> Agent:
-        return {"toy": lambda: toy.ToyAgent(SPEC), "td3": make_td3, "mbdpg": make_mbdpg}[request.param]()
-
+    makers = {"toy": lambda: toy.ToyAgent(SPEC), "td3": make_td3, "sac": make_sac, "mbdpg": make_mbdpg}
+    make = makers[request.param]
     together, alone = Learner(make(), [4, 9]), Learner(make(), [9])
     return Two(together, alone, learn(together, [4, 9]), learn(alone, [9]))
 
