@@ -1,9 +1,10 @@
-"""The verbs: train, resume, evaluate, demonstrate."""
+"""The verbs: train, resume, evaluate, demonstrate, benchmark."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import json
 import re
 import time
 from collections.abc import Sequence
@@ -18,13 +19,14 @@ from mbdpg import envs
 from mbdpg.cli.compilations import keep_compilations
 from mbdpg.cli.flags import parse, peek
 from mbdpg.cli.stopping import Stop
-from mbdpg.experiments import expert, presets
+from mbdpg.experiments import benchmark, expert, presets
 from mbdpg.experiments.config import Algorithm, EnvOptions, RunConfig
 from mbdpg.experiments.run import load_policy, resume, train
 from mbdpg.interfaces import require
 from mbdpg.reports.console import RunDisplay
 from mbdpg.reports.curves import draw_curves
 from mbdpg.reports.video import VideoWriter
+from mbdpg.storage.files import replace_durably
 from mbdpg.storage.run_folder import RunFolder
 from mbdpg.training.evaluation import evaluate
 from mbdpg.training.loop import Schedule
@@ -104,6 +106,18 @@ class Demonstrate:
     seed: int = 0
     """Random seed of the expert and of its episodes."""
     env_options: tyro.conf.OmitArgPrefixes[EnvOptions] = field(default_factory=EnvOptions)
+    debug: bool = False
+    """Show the traceback of an error."""
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """Measure on this machine: updates at the paper's sizes, acting, starting, memory. A few minutes."""
+
+    json: Path | None = None
+    """File that gets all numbers."""
+    quick: bool = False
+    """Leave out how the time grows with horizon, batch, width and seeds."""
     debug: bool = False
     """Show the traceback of an error."""
 
@@ -242,4 +256,20 @@ def make_demonstrations(flags: Demonstrate) -> None:
     print(f"demonstrations in {flags.out}; they cost {found.expert_env_steps} environment steps")
 
 
-VERBS = {"train": _train, "resume": _resume, "evaluate": _evaluate, "demonstrate": _demonstrate}
+def _benchmark(args: list[str]) -> None:
+    flags = parse(Benchmark, "benchmark", args)
+    file = flags.json
+    require(file is None or file.absolute().parent.is_dir(), f"--json is {file}, expected a file in an existing folder")
+    measured = benchmark.benchmark(lambda line: print(line, flush=True), growth=not flags.quick)
+    if file is not None:
+        replace_durably(file, json.dumps(measured, indent=2).encode())
+        print(f"all numbers in {file}")
+
+
+VERBS = {
+    "train": _train,
+    "resume": _resume,
+    "evaluate": _evaluate,
+    "demonstrate": _demonstrate,
+    "benchmark": _benchmark,
+}

@@ -1,0 +1,280 @@
+"""What this machine makes of MBDPG: its updates against their own matrix products, acting, starting, memory.
+
+Every time is the median of a few calls on this machine at this moment; compare what one invocation measured.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mbdpg.agents import mbdpg
+from mbdpg.experiments.config import RunConfig
+from mbdpg.interfaces import Agent, EnvSpec, Phase
+from mbdpg.storage.run_folder import describe_machine
+from mbdpg.training.learner import Learner
+from mbdpg.training.replay import Replay
+
+TASK = "HalfCheetah-v5"
+SPEC = EnvSpec(TASK, observation_size=17, action_size=6, episode_limit=1000, reference_return=4800.0)
+PAPER_SIZES = mbdpg.Config(horizon=20, batch_size=128, fit_batch_size=128, fit_length=10, gaussians=5)
+"""Section 5.1's batch, horizon, training length and networks, in the default method with the full gradient."""
+
+ROWS = 2000
+"""Made-up environment steps that updates learn from."""
+DEFAULTS = mbdpg.Config()
+"""What a fresh process starts with."""
+REPLAY_ROWS = 200_000
+"""Environment steps of a run whose peak memory is measured."""
+UPDATES = 4
+"""Gradient steps per timed call, in one compiled loop as in training."""
+CALLS = 5
+GROWTH = {"horizon": (5, 10, 40), "batch_size": (32, 64, 256), "width": (64, 128, 512), "seeds": (1, 2, 4)}
+
+
+class Product(NamedTuple):
+    """The shape of a matrix product: `batch` times (rows, inner) by (inner, columns)."""
+
+    batch: int
+    rows: int
+    inner: int
+    columns: int
+
+    @property
+    def gflop(self) -> float:
+        """2 operations per multiplication and addition."""
+        return 2e-9 * self.batch * self.rows * self.inner * self.columns
+
+
+class Cost(NamedTuple):
+    """One update of a kind."""
+
+    ms: float
+    gflop: float
+    """Of its matrix products, counted from their shapes."""
+    attainable_gflops: float
+    """Rate of the same products, each repeated by itself."""
+
+    @property
+    def share(self) -> float:
+        """Of the attainable rate."""
+        return self.gflop / (self.ms * 1e-3) / self.attainable_gflops
+
+
+def benchmark(say: Callable[[str], None], *, growth: bool = True) -> dict[str, Any]:
+    """Measure everything; a few minutes.
+
+    Args:
+        say: called with a line of text per result.
+        growth: also time the updates at other sizes and numbers of seeds.
+
+    Returns:
+        Numbers by name, for JSON: times in the unit that the name ends with, rates in GFLOP/s, memory in MiB.
+    """
+    improve, fit = cost_of("improving", PAPER_SIZES), cost_of("fitting", PAPER_SIZES)
+    rate = (improve.gflop + fit.gflop) / (improve.gflop / improve.attainable_gflops + fit.gflop / fit.attainable_gflops)
+    result: dict[str, Any] = {"attainable_gflops": rate}
+    for name, cost in (("improve", improve), ("fit", fit)):
+        result |= {f"{name}_ms": cost.ms, f"{name}_gflop": cost.gflop, f"{name}_share": cost.share}
+        say(
+            f"{name}: {cost.ms:.1f} ms, {cost.gflop:.2f} GFLOP, {100 * cost.share:.0f} % of the "
+            f"{cost.attainable_gflops:.0f} GFLOP/s that its matrix products attain by themselves"
+        )
+    result |= _acting(say) | _starting(say)
+    if growth:
+        result["growth_ms"] = _growth(say)
+    return result | {"task": TASK, "sizes": dataclasses.asdict(PAPER_SIZES), "machine": describe_machine()}
+
+
+def cost_of(phase_name: str, config: mbdpg.Config) -> Cost:
+    """Time one update of a phase, as training takes it, and its matrix products alone."""
+    learner = _learner(config)
+    phase = _phase(learner.agent, phase_name)
+    ms = _update_ms(learner, phase)
+    batch = jax.tree.map(lambda x: x[0], _batches(phase, 1))
+    state = jax.tree.map(lambda x: x[0], learner.state)
+    update = jax.make_jaxpr(lambda s, b, k: phase.update(s, b, key=k))(state, batch, jax.random.key(0))
+    products = matrix_products(update.jaxpr)
+    gflop = sum(product.gflop * count for product, count in products.items())
+    seconds = sum(_product_seconds(product) * count for product, count in products.items())
+    return Cost(ms, gflop, gflop / seconds)
+
+
+def matrix_products(program: Any) -> Counter[Product]:
+    """Every matrix product that a traced program (a jaxpr) takes, loops counted as often as they go round."""
+    found: Counter[Product] = Counter()
+    for equation in program.eqns:
+        if equation.primitive.name == "dot_general":
+            left, right = (operand.aval.shape for operand in equation.invars)
+            found[_product(left, right, equation.params["dimension_numbers"])] += 1
+        inside = [matrix_products(inner) for inner in _programs(equation.params.values())]
+        if equation.primitive.name == "cond":  # one of them is taken: count the dearest
+            inside = [max(inside, key=lambda products: sum(p.gflop * n for p, n in products.items()))]
+        rounds = equation.params["length"] if equation.primitive.name == "scan" else 1
+        for products in inside:
+            found += Counter({product: rounds * count for product, count in products.items()})
+    return found
+
+
+def _programs(parameters: Iterable[Any]) -> Iterable[Any]:
+    for value in parameters:
+        for item in value if isinstance(value, tuple | list) else (value,):
+            item = getattr(item, "jaxpr", item)
+            if hasattr(item, "eqns"):
+                yield item
+
+
+def _product(left: tuple[int, ...], right: tuple[int, ...], dimensions: Any) -> Product:
+    (contracted, contracted_right), (batched, batched_right) = dimensions
+
+    def size(shape: tuple[int, ...], axes: Iterable[int]) -> int:
+        return math.prod(shape[axis] for axis in axes)
+
+    rows = set(range(len(left))) - {*contracted, *batched}
+    columns = set(range(len(right))) - {*contracted_right, *batched_right}
+    return Product(size(left, batched), size(left, rows), size(left, contracted), size(right, columns))
+
+
+def _product_seconds(product: Product) -> float:
+    """Time of one product, from a compiled loop over as many as take some milliseconds."""
+    repeats = int(np.clip(0.5 / product.gflop, 2, 200))
+    rng = np.random.default_rng(0)
+    left = jnp.asarray(rng.normal(size=(repeats, product.batch, product.rows, product.inner)), jnp.float32)
+    right = jnp.asarray(rng.normal(size=(product.batch, product.inner, product.columns)), jnp.float32)
+    loop = jax.jit(lambda left, right: jax.lax.map(lambda x: x @ right, left))
+    return _median_seconds(lambda: loop(left, right).block_until_ready()) / repeats
+
+
+def _acting(say: Callable[[str], None]) -> dict[str, float]:
+    """The NumPy policy's time per action, and environment steps per second with it."""
+    policy = _learner(PAPER_SIZES).policies()[0]
+    env = RunConfig(TASK).make_env()
+    observation = env.reset(seed=0)
+
+    def act() -> None:
+        for _ in range(500):
+            policy(observation)
+
+    def step() -> None:
+        place = env.reset(seed=0)
+        for _ in range(500):
+            place = env.step(policy(place)).observation
+
+    result = {"policy_us": 1e6 * _median_seconds(act) / 500, "env_steps_per_s": 500 / _median_seconds(step)}
+    env.close()
+    say(f"policy: {result['policy_us']:.1f} us per action; {TASK}: {result['env_steps_per_s']:.0f} steps/s with it")
+    return result
+
+
+def _starting(say: Callable[[str], None]) -> dict[str, float]:
+    """A fresh process up to its first updates, with nothing compiled before and then with everything; its memory."""
+    result: dict[str, float] = {}
+    with tempfile.TemporaryDirectory() as cache:
+        keep = {"JAX_COMPILATION_CACHE_DIR": cache, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.3"}
+        code = "import sys, mbdpg.cli; from mbdpg.experiments import benchmark; benchmark.start(*sys.argv[1:])"
+        settings = json.dumps(dataclasses.asdict(DEFAULTS))
+        for name in ("cold_start_s", "warm_start_s"):
+            command = [sys.executable, "-c", code, settings, str(REPLAY_ROWS), str(time.time())]
+            done = subprocess.run(command, env=os.environ | keep, stdout=subprocess.PIPE, text=True, check=True)
+            result |= {name: (measured := json.loads(done.stdout))["seconds"], "peak_memory_mb": measured["memory_mb"]}
+    say(f"from the start to the first updates: {result['cold_start_s']:.1f} s, compiled {result['warm_start_s']:.1f} s")
+    say(f"peak memory with {REPLAY_ROWS:,} steps: {result['peak_memory_mb']:.0f} MiB")
+    return result
+
+
+def start(settings: str, rows: str, began: str) -> None:
+    """Take one update of every kind in this fresh process, fill a replay, and print seconds and memory as JSON.
+
+    Args:
+        settings: of the agent, as JSON.
+        rows: environment steps in the replay.
+        began: seconds since the epoch at which the process was started.
+    """
+    learner = _learner(mbdpg.Config(**json.loads(settings)))
+    for phase in learner.agent.phases:
+        if phase.updates_per_step:
+            learner.update(phase, [_batches(phase, 1)], 0)
+    seconds = time.time() - float(began)
+    kept = _replay(int(rows))
+    print(json.dumps({"seconds": seconds, "memory_mb": _peak_memory_mb(), "rows": kept.size}))
+
+
+def _peak_memory_mb() -> float:
+    """Greatest resident memory of this process, in MiB."""
+    try:
+        # Linux's getrusage begins with the peak of the process that this one was forked from.
+        with open("/proc/self/status", encoding="utf-8") as lines:
+            return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1024
+    except OSError:  # macOS, in bytes
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+
+
+def _growth(say: Callable[[str], None]) -> dict[str, dict[str, dict[int, float]]]:
+    """Milliseconds of an update at other sizes and numbers of seeds, one thing changed at a time."""
+    grown: dict[str, dict[str, dict[int, float]]] = {}
+    for name, sizes in GROWTH.items():
+        grown[name] = {"improving": {}, "fitting": {}}
+        for size in sizes:
+            changed: dict[str, Any] = {"seeds": {}, "batch_size": {"batch_size": size, "fit_batch_size": size}}.get(
+                name, {name: size}
+            )
+            config = dataclasses.replace(PAPER_SIZES, **changed)
+            learner = _learner(config, size if name == "seeds" else 1)
+            for kind, times in grown[name].items():
+                times[size] = _update_ms(learner, _phase(learner.agent, kind))
+            say(f"{name} {size}: " + ", ".join(f"{kind} {times[size]:.1f} ms" for kind, times in grown[name].items()))
+    return grown
+
+
+def _update_ms(learner: Learner, phase: Phase) -> float:
+    batches = [_batches(phase, UPDATES)] * len(learner.policies())
+    return 1e3 * _median_seconds(lambda: learner.update(phase, batches, 0)) / UPDATES
+
+
+def _median_seconds(call: Callable[[], Any]) -> float:
+    """Median time of a call that returns when it is done; the first, which compiles, does not count."""
+    call()
+    seconds = []
+    for _ in range(CALLS):
+        began = time.perf_counter()
+        call()
+        seconds.append(time.perf_counter() - began)
+    return float(np.median(seconds))
+
+
+def _learner(config: mbdpg.Config, seeds: int = 1) -> Learner:
+    learner = Learner(mbdpg.MBDPG(config, SPEC), range(seeds))
+    learner.prepare([_replay(ROWS).statistics(0.0)] * seeds)
+    return learner
+
+
+def _phase(agent: Agent, name: str) -> Phase:
+    return next(phase for phase in agent.phases if phase.name == name)
+
+
+def _batches(phase: Phase, updates: int) -> Any:
+    return _replay(ROWS).sample(updates, phase.sampling, np.random.default_rng(0))
+
+
+def _replay(rows: int) -> Replay:
+    """Made-up steps, in episodes of 1,000."""
+    replay, rng = Replay(SPEC.observation_size, SPEC.action_size), np.random.default_rng(0)
+    for row in range(rows):
+        observation, after = rng.normal(size=(2, SPEC.observation_size)).astype(np.float32)
+        action = rng.uniform(-1, 1, SPEC.action_size).astype(np.float32)
+        replay.add(observation, action, rng.normal(), after, False, row % 1000 == 999)
+    return replay
