@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from mbdpg import envs
-from mbdpg.agents import mbdpg
 from mbdpg.experiments import run
 from mbdpg.experiments.config import AgentConfig, RunConfig, algorithm_of
+from mbdpg.experiments.presets import agent_config
 from mbdpg.interfaces import Environment
 from mbdpg.networks.policy import NumpyPolicy
 from mbdpg.training.evaluation import Evaluation, evaluate as run_episodes
@@ -34,7 +34,7 @@ def train(
 
     Args:
         env: a Gymnasium id, or a function that makes an environment (called a few times).
-        config: the agent's settings; by default MBDPG's own.
+        config: the agent's settings; by default MBDPG's, as `mbdpg train` has them for this task.
         schedule: length of the run, and how often it evaluates and saves.
         seeds: one run each, all in this process.
         out: a folder that gets one run folder `seed-<seed>` per seed.
@@ -47,7 +47,7 @@ def train(
     Raises:
         UserError: something you can mend, said in one line.
     """
-    agent = mbdpg.Config() if config is None else config
+    agent = agent_config("mbdpg", "default", env if isinstance(env, str) else None) if config is None else config
     settings = RunConfig(
         env=env if isinstance(env, str) else _name(env) or "environment made in code",
         algorithm=algorithm_of(agent),

@@ -20,7 +20,7 @@ from mbdpg.cli.compilations import keep_compilations
 from mbdpg.cli.flags import parse, peek
 from mbdpg.cli.stopping import Stop
 from mbdpg.experiments import benchmark, expert, presets
-from mbdpg.experiments.config import Algorithm, EnvOptions, RunConfig
+from mbdpg.experiments.config import AgentConfig, Algorithm, EnvOptions, RunConfig
 from mbdpg.experiments.run import load_policy, resume, train
 from mbdpg.interfaces import require
 from mbdpg.reports.console import RunDisplay
@@ -122,10 +122,8 @@ class Benchmark:
     """Show the traceback of an error."""
 
 
-def _train(args: list[str]) -> None:
-    algorithm: Any = peek(args, "algorithm", "mbdpg")
-    preset: Any = peek(args, "preset", "default")
-    agent = presets.agent_config(algorithm, preset)
+def _train_flags(args: list[str], preset: str, agent: AgentConfig) -> Any:
+    """What `mbdpg train` is told, over a preset's settings."""
     schedule, env_options = presets.run_settings(preset)
     flat = tyro.conf.OmitArgPrefixes
     command = dataclasses.make_dataclass(
@@ -140,7 +138,17 @@ def _train(args: list[str]) -> None:
         frozen=True,
     )
     command.__doc__ = "Learn a policy for a Gymnasium environment."
-    flags = parse(command, "train", args)
+    return parse(command, "train", args)
+
+
+def _train(args: list[str]) -> None:
+    algorithm: Any = peek(args, "algorithm", "mbdpg")
+    preset = peek(args, "preset", "default")
+    agent = presets.agent_config(algorithm, preset, args[0] if args else None)
+    flags = _train_flags(args, preset, agent)
+    own = presets.agent_config(algorithm, preset, flags.env)
+    if own != agent:  # the task's id stands elsewhere
+        flags = _train_flags(args, preset, own)
     keep_compilations()
     config = RunConfig(flags.env, algorithm, flags.agent, flags.schedule, flags.env_options)
     name = re.sub(r"[^A-Za-z0-9.-]+", "-", flags.env)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 
+import gymnasium
 import jax
 import pytest
 
 from mbdpg.agents import mbdpg, sac, td3
 from mbdpg.experiments.config import CONFIGS, RunConfig
-from mbdpg.experiments.presets import PAPER, agent_config, run_settings
+from mbdpg.experiments.presets import PAPER, TASKS, agent_config, run_settings
 from mbdpg.interfaces import EnvSpec, UserError
 from mbdpg.training.loop import Schedule
 
@@ -71,6 +72,21 @@ def test_the_default_preset_is_the_configs_own_defaults() -> None:
     assert agent_config("td3", "default") == td3.Config() and agent_config("sac", "default") == sac.Config()
     schedule, options = run_settings("default")
     assert schedule == Schedule() and options == RunConfig("Pendulum-v1").env_options
+
+
+def test_a_task_of_its_own_settings_keeps_all_others() -> None:
+    own = agent_config("mbdpg", "default", "LunarLanderContinuous-v3")
+    assert own == mbdpg.Config(trace=1.0) == agent_config("mbdpg", "default", "LunarLanderContinuous-v2")
+    assert agent_config("mbdpg", "default", "Hopper-v5") == mbdpg.Config()
+    assert agent_config("mbdpg", "paper", "LunarLanderContinuous-v3") == agent_config("mbdpg", "paper")
+    assert agent_config("td3", "default", "LunarLanderContinuous-v3") == td3.Config()
+
+
+@pytest.mark.parametrize(("algorithm", "env"), [(name, env) for name, tasks in TASKS.items() for env in tasks])
+def test_a_task_s_settings_are_of_a_registered_task_and_differ_from_the_default(algorithm: str, env: str) -> None:
+    assert env in gymnasium.registry
+    for name, value in TASKS[algorithm][env].items():
+        assert getattr(agent_config(algorithm, "default"), name) != value
 
 
 def test_the_rivals_have_their_authors_networks_and_settings() -> None:
