@@ -13,18 +13,20 @@ VENV = .venv
 BIN  = $(VENV)/bin
 PIP  = $(BIN)/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: help setup setup-dev train test test-slow test-gpu check format clean
+.PHONY: help setup setup-dev peers train test test-slow test-gpu check format clean
 
 help:
 	@echo 'make setup      install mbdpg and its pinned requirements into $(VENV)'
 	@echo 'make train      the ten-minute demonstration: learns $(DEMO_TASK)'
 	@echo 'make test       the test suite, without its slow and GPU parts (make test-slow, make test-gpu)'
 	@echo 'make check      lint, format, types, import rules'
+	@echo 'make peers      install the programs that benchmarks/ compares with into $(VENV)-peers'
 	@echo 'make format     mend what the linter and the formatter can mend'
-	@echo 'make clean      remove $(VENV), caches and builds; runs/ stays'
+	@echo 'make clean      remove $(VENV), $(VENV)-peers, caches and builds; runs/ stays'
 
 setup: $(VENV)/.installed
 setup-dev: $(VENV)/.installed-dev
+peers: $(VENV)-peers/.installed
 
 train: setup
 	$(BIN)/mbdpg train $(DEMO_TASK) $(DEMO_FLAGS) --out $(DEMO_OUT)
@@ -54,7 +56,7 @@ format: setup-dev
 	$(BIN)/ruff format --quiet
 
 clean:
-	rm -rf $(VENV) build dist .mypy_cache .pytest_cache .ruff_cache .import_linter_cache
+	rm -rf $(VENV) $(VENV)-peers build dist .mypy_cache .pytest_cache .ruff_cache .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Stamps: an environment is installed again only when what it is made from has changed.
@@ -77,3 +79,9 @@ $(VENV)/.installed-dev: $(VENV)/.installed requirements-dev.txt
 	@echo 'Installing the test and check tools ...'
 	@$(PIP) install -r requirements-dev.txt
 	@touch $@
+
+$(VENV)-peers/.installed: $(BIN)/python requirements-peers.txt
+	@$(BIN)/python -m venv $(VENV)-peers
+	@$(VENV)-peers/bin/python -m pip --disable-pip-version-check --quiet install -r requirements-peers.txt
+	@touch $@
+	@echo 'Ready: $(VENV)-peers/bin/python benchmarks/peers.py --help'
