@@ -195,9 +195,10 @@ class Agent(Protocol):
         """What has been learned: the deterministic policy that is evaluated and saved, and its normalizer."""
 
     def behavior(self, state: Any) -> tuple[Any, Any, Any]:
-        """What collects experience: a deterministic policy, its normalizer, and the noise's standard deviation.
+        """What collects experience: a policy, its normalizer, and the standard deviation of the noise it is given.
 
-        The last is the mean over episodes, in units of half the action range.
+        The last is the mean over episodes: for a deterministic policy in units of half the action range, for a Gaussian
+        one in standard deviations of its own.
         """
 
     def diagnose(self, state: Any, batch: Batch, realized_return: Any) -> Metrics:

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from mbdpg.agents import objectives
 from mbdpg.interfaces import Batch, EnvSpec, Metrics, Phase, Sampling, Statistics, require_settings
@@ -71,7 +71,6 @@ class State(eqx.Module):
     normalizer: Normalizer
     return_scale: Float[Array, ""]
     """Reward that counts as one unit of value."""
-    updates: Int[Array, ""]
 
 
 class SAC:
@@ -102,9 +101,8 @@ class SAC:
             actor_optimizer=self._optimizer.init(actor),
             critic_optimizer=self._optimizer.init(critics),
             temperature_optimizer=self._optimizer.init(temperature),
-            normalizer=identity(o),
+            normalizer=identity(o, bounded=not c.plain),
             return_scale=jnp.ones(()),
-            updates=jnp.zeros((), jnp.int32),
         )
 
     def prepare(self, state: State, statistics: Statistics) -> State:
@@ -149,9 +147,9 @@ class SAC:
 
         (actor_value, density), gradient = jax.value_and_grad(actor_loss, has_aux=True)(state.actor)
         actor, actor_optimizer = self._step(state.actor, gradient, state.actor_optimizer)
-        # The gradient of -log(temperature) (log pi + wanted entropy).
-        missing = -density - self.config.entropy_per_action * self.env.action_size
-        log_temperature, temperature_optimizer = self._step(state.log_temperature, missing, state.temperature_optimizer)
+        # The gradient of -log(temperature) (log pi + wanted entropy) is what there is of entropy beyond that wanted.
+        surplus = -density - self.config.entropy_per_action * self.env.action_size
+        log_temperature, temperature_optimizer = self._step(state.log_temperature, surplus, state.temperature_optimizer)
 
         return State(
             actor=actor,
@@ -163,7 +161,6 @@ class SAC:
             temperature_optimizer=temperature_optimizer,
             normalizer=state.normalizer,
             return_scale=state.return_scale,
-            updates=state.updates + 1,
         ), {
             "critic/loss": loss,
             "critic/q_mean": jnp.mean(values) * state.return_scale,

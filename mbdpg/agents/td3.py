@@ -103,7 +103,7 @@ class TD3:
             target_critics=jax.tree.map(jnp.copy, critics),
             actor_optimizer=self._optimizer.init(actor),
             critic_optimizer=self._optimizer.init(critics),
-            normalizer=identity(o),
+            normalizer=identity(o, bounded=not c.plain),
             return_scale=jnp.ones(()),
             updates=jnp.zeros((), jnp.int32),
         )

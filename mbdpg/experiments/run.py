@@ -117,7 +117,7 @@ def resume(
             config = dataclasses.replace(config, schedule=schedule)
             recorders = [_Recorder(folder, checkpoint)]
             training = _compose(config, spec, make, [_seed_of(folder)], recorders, stack, None, checkpoint)
-        except (KeyError, IndexError, TypeError, ValueError) as error:
+        except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise UserError(
                 f"the checkpoint of {path} at {checkpoint.env_steps} steps is not one that mbdpg wrote ({error!r})"
             ) from error
@@ -249,11 +249,11 @@ def _compose(
 
 
 def _say_what_changed(path: Path, recorded: Any) -> None:
-    """A resume repeats bytes only on the same processor and versions: say what is another one now."""
+    """A resume repeats bytes only on the same processor, cores and versions: say what is another one now."""
     before: dict[str, Any] = recorded if isinstance(recorded, dict) else {}
     versions, now = before.get("versions"), describe_machine()
     versions = versions if isinstance(versions, dict) else {}
-    changed = [name for name in ("cpu", "python", "XLA_FLAGS") if before.get(name) != now[name]]
+    changed = [name for name in ("cpu", "cores", "python", "XLA_FLAGS") if before.get(name) != now[name]]
     changed += [name for name, version in now["versions"].items() if versions.get(name) != version]
     if changed:
         print(f"mbdpg: {path} was begun with another {', '.join(changed)}; its results may differ", file=sys.stderr)

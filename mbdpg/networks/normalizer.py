@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 BOUND = 10.0
@@ -15,17 +16,20 @@ class Normalizer(eqx.Module):
 
     mean: Float[Array, " observation"]
     std: Float[Array, " observation"]
+    bound: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(BOUND))
+    """Outliers are clipped at this many standard deviations."""
 
     def __call__(self, observation: Float[Array, "*batch observation"]) -> Float[Array, "*batch observation"]:
-        """Normalize, and clip at `BOUND` standard deviations."""
+        """Normalize and clip."""
         lead = (1,) * (observation.ndim - 1)
         scaled = (observation - self.mean.reshape(lead + self.mean.shape)) / self.std.reshape(lead + self.std.shape)
-        return jnp.clip(scaled, -BOUND, BOUND)
+        return jnp.clip(scaled, -self.bound, self.bound)
 
 
-def identity(size: int) -> Normalizer:
-    """The normalizer that only clips."""
-    return Normalizer(jnp.zeros(size), jnp.ones(size))
+def identity(size: int, *, bounded: bool = True) -> Normalizer:
+    """The normalizer that clips at most."""
+    bound = BOUND if bounded else float(np.finfo(np.float32).max)
+    return Normalizer(jnp.zeros(size), jnp.ones(size), jnp.asarray(bound, jnp.float32))
 
 
 def soft_bound(x: Float[Array, "..."]) -> Float[Array, "..."]:

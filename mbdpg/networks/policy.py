@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from mbdpg.networks.mlp import MLP, Linear
-from mbdpg.networks.normalizer import BOUND, Normalizer
+from mbdpg.networks.normalizer import Normalizer
 
 
 class Policy(eqx.Module):
@@ -72,12 +72,12 @@ class NumpyPolicy:
         Raises:
             ValueError: a parameter is missing, misshapen or not finite.
         """
-        self.arrays = {name: np.ascontiguousarray(value, np.float32) for name, value in arrays.items()}
+        self.arrays = {name: np.asarray(value, np.float32, order="C") for name, value in arrays.items()}
         layers = sum(name.startswith("hidden/") and name.endswith("/weight") for name in arrays)
         plain = not any(name.endswith(("/scale", "/offset")) for name in arrays)
         parts = ("weight", "bias") if plain else ("weight", "bias", "scale", "offset")
         try:
-            self._mean, self._std = self.arrays["mean"], self.arrays["std"]
+            self._mean, self._std, self._bound = (self.arrays[name] for name in ("mean", "std", "bound"))
             self._hidden = [tuple(self.arrays[f"hidden/{i}/{part}"] for part in parts) for i in range(layers)]
             self._output = self.arrays["output/weight"], self.arrays["output/bias"]
             self._spread = None
@@ -119,7 +119,7 @@ class NumpyPolicy:
         x = np.asarray(observation, np.float32)
         if x.shape != self._mean.shape:
             raise ValueError(f"the policy takes observations of shape {self._mean.shape}, not {x.shape}")
-        x = np.clip((x - self._mean) / self._std, -BOUND, BOUND)
+        x = np.clip((x - self._mean) / self._std, -self._bound, self._bound)
         for weight, bias, *norm in self._hidden:
             x = x @ weight + bias
             if not norm:
@@ -133,8 +133,9 @@ class NumpyPolicy:
         return x
 
     def _check(self) -> None:
-        if self._mean.ndim != 1 or self._std.shape != self._mean.shape:
-            raise ValueError(f"the policy's normalizer has shapes {self._mean.shape} and {self._std.shape}")
+        shapes = self._mean.shape, self._std.shape, self._bound.shape
+        if self._mean.ndim != 1 or shapes != (self._mean.shape, self._mean.shape, ()):
+            raise ValueError(f"the policy's normalizer has shapes {shapes}")
         width = self._mean.shape[0]
         for weight, *vectors in self._hidden:
             if weight.ndim != 2 or weight.shape[0] != width or {v.shape for v in vectors} != {weight.shape[1:]}:
@@ -148,13 +149,14 @@ class NumpyPolicy:
         for name, value in self.arrays.items():
             if not np.isfinite(value).all():
                 raise ValueError(f"the policy's array {name} is not finite")
-        if not (self._std > 0).all():
-            raise ValueError("the policy's array std is not positive")
+        for name in ("std", "bound"):
+            if not (self.arrays[name] > 0).all():
+                raise ValueError(f"the policy's array {name} is not positive")
 
 
 def policy_arrays(policy: Policy | GaussianPolicy, normalizer: Normalizer) -> dict[str, np.ndarray]:
     """The policy with its normalizer as named float32 arrays, for `NumpyPolicy` and for the run folder."""
-    arrays: dict[str, Array] = {"mean": normalizer.mean, "std": normalizer.std}
+    arrays: dict[str, Array] = {"mean": normalizer.mean, "std": normalizer.std, "bound": normalizer.bound}
     if isinstance(policy, GaussianPolicy):
         arrays |= {"spread/weight": policy.spread.weight, "spread/bias": policy.spread.bias}
         policy = policy.center

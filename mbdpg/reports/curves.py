@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -12,6 +13,7 @@ matplotlib.use("Agg")  # no display is ever needed
 from matplotlib import pyplot as plt
 
 from mbdpg.interfaces import UserError
+from mbdpg.storage.files import replace_durably
 from mbdpg.storage.metrics import read_metrics
 
 
@@ -42,12 +44,13 @@ def draw_curves(groups: Mapping[str, Sequence[Path]], path: Path, *, title: str)
     axes.set(xlabel="environment steps", ylabel="evaluation return", title=title)
     axes.grid(alpha=0.3)
     axes.legend()
+    picture = io.BytesIO()
+    figure.savefig(picture, format=path.suffix[1:], dpi=130)
+    plt.close(figure)
     try:
-        figure.savefig(path, dpi=130)
+        replace_durably(path, picture.getvalue())  # and not what a link there points to
     except OSError as error:
         raise UserError(f"cannot write {path}: {error.strerror}") from error
-    finally:
-        plt.close(figure)
 
 
 def _curve(run: Path) -> dict[int, float]:

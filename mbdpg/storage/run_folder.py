@@ -120,10 +120,10 @@ class RunFolder:
 
 
 def describe_machine() -> dict[str, Any]:
-    """Return what decides whether a run can be repeated bit for bit: processor, versions, XLA flags (JSON)."""
+    """Return what decides whether a run repeats bit for bit: processor, cores to use, versions, XLA flags (JSON)."""
     return {
         "cpu": _cpu_model(),
-        "cores": os.cpu_count(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "platform": platform.platform(),
         "python": platform.python_version(),
         "versions": {package: _version(package) for package in _PACKAGES},

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from mbdpg.envs import episode_seed
-from mbdpg.interfaces import Environment, Metrics, Phase, flag_of, require
+from mbdpg.interfaces import Environment, Metrics, Phase, flag_of, require, require_settings
 from mbdpg.networks.policy import NumpyPolicy
 from mbdpg.training.collector import Collector
 from mbdpg.training.evaluation import Evaluation, diagnosis_windows, evaluate
@@ -38,8 +38,8 @@ class Schedule:
     """Environment steps between two checkpoints."""
 
     def __post_init__(self) -> None:
-        for name in ("steps", "cycle", "evaluate_every", "evaluation_episodes", "log_every", "checkpoint_every"):
-            require(getattr(self, name) >= 1, f"{flag_of(name)} is {getattr(self, name)}, expected at least 1")
+        names = ("steps", "cycle", "evaluate_every", "evaluation_episodes", "log_every", "checkpoint_every")
+        require_settings(self, positive=names)
         for name in ("steps", "evaluate_every", "log_every", "checkpoint_every"):
             value = getattr(self, name)
             whole = value % self.cycle == 0

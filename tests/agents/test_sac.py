@@ -74,7 +74,7 @@ def test_every_update_moves_all_that_learns_and_the_targets_follow() -> None:
     before = state()
     after, _ = update(before, batch())
     optimizers = {"actor_optimizer", "critic_optimizer", "temperature_optimizer"}
-    assert moved(before, after) == LEARNED | optimizers | {"target_critics", "updates"}
+    assert moved(before, after) == LEARNED | optimizers | {"target_critics"}
     for old, new, followed in zip(
         *map(jax.tree.leaves, (before.target_critics, after.target_critics, after.critics)), strict=True
     ):
@@ -103,11 +103,45 @@ def test_the_losses_are_numpys() -> None:
     assert float(metrics["actor/entropy"]) == pytest.approx(-float(np.mean(density)), rel=1e-4)
 
 
-@pytest.mark.parametrize(("wanted", "rises"), [(-20.0, False), (20.0, True)])
-def test_the_temperature_rises_where_entropy_is_missing(wanted: float, rises: bool) -> None:
-    one = agent(entropy_per_action=wanted)
+def test_the_actor_steps_down_the_gradient_of_its_loss() -> None:
+    s, b = state(), jax.tree.map(jnp.asarray, batch())
+    after, _ = update(s, batch())
+    observation = s.normalizer(b.observation[:, 0])
+    noise = jax.random.normal(jax.random.split(jax.random.key(0))[1], (BATCH, A))
+
+    def loss(actor: Any) -> jax.Array:
+        features = actor.center.mlp.features(observation)
+        log_std = actor.spread(features)
+        unbounded = actor.center.mlp.output(features) + jnp.exp(log_std) * noise
+        action = jnp.tanh(unbounded)
+        density = jnp.sum(-0.5 * noise**2 - log_std - jnp.log(1 - action**2), axis=-1)
+        return jnp.mean(jnp.exp(s.log_temperature) * density - jnp.min(after.critics(observation, action), axis=0))
+
+    gradient = jax.grad(loss)(s.actor)
+    for old, new, slope in zip(*map(jax.tree.leaves, (s.actor, after.actor, gradient)), strict=True):
+        steep = np.abs(slope) > 1e-4  # of the first step of Adam only the sign is left
+        np.testing.assert_allclose(np.asarray(new - old)[steep], -3e-4 * np.sign(slope)[steep], rtol=2e-2)
+
+
+@pytest.mark.parametrize("more", [-0.1, 0.1])
+def test_the_temperature_rises_just_where_entropy_is_missing(more: float) -> None:
+    entropy = float(update(state(), batch())[1]["actor/entropy"])
+    one = agent(entropy_per_action=entropy / A + more)
     after, _ = one.update(state(), jax.tree.map(jnp.asarray, batch()), key=jax.random.key(0))
-    assert (after.log_temperature > state().log_temperature) == rises
+    assert bool(after.log_temperature > state().log_temperature) == (more > 0)
+
+
+def test_without_rewards_a_narrow_policy_widens() -> None:
+    narrow = eqx.tree_at(lambda x: x.actor.spread.bias, agent().init(key=jax.random.key(0)), jnp.full(A, -3.0))
+    nothing = jax.tree.map(jnp.asarray, batch()._replace(reward=np.zeros((BATCH, 1), np.float32)))
+    one = agent(learning_rate=1e-2)
+
+    def step(state: State, key: jax.Array) -> tuple[State, None]:
+        return one.update(state, nothing, key=key)[0], None
+
+    wide = jax.jit(lambda s, keys: jax.lax.scan(step, s, keys)[0])(narrow, jax.random.split(jax.random.key(1), 400))
+    features = wide.actor.center.mlp.features(nothing.observation[:, 0])
+    assert float(jnp.mean(jnp.exp(wide.actor.spread(features)))) > 0.4
 
 
 def test_what_follows_an_end_changes_nothing_and_what_follows_a_time_limit_does() -> None:
@@ -132,6 +166,8 @@ def test_plain_networks_see_observations_and_rewards_as_they_are() -> None:
     fresh = one.init(key=jax.random.key(0))
     assert not moved(fresh, one.prepare(fresh, STATISTICS))
     assert len(fresh.actor.center.mlp.hidden) == 2 and not fresh.actor.center.mlp.norms
+    far = jnp.asarray([20.0, -3000.0, 1.0])
+    np.testing.assert_array_equal(fresh.normalizer(far), far)
 
 
 def test_the_center_is_evaluated_and_the_gaussian_collects() -> None:

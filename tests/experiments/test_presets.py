@@ -89,12 +89,20 @@ def test_a_task_s_settings_are_of_a_registered_task_and_differ_from_the_default(
         assert getattr(agent_config(algorithm, "default"), name) != value
 
 
-def test_the_rivals_have_their_authors_networks_and_settings() -> None:
+def test_the_rivals_have_their_authors_sizes_and_settings() -> None:
     # Haarnoja et al. 2018b, Table 1; Fujimoto et al. 2018, as in their code since 2020.
     shared = {"layers": 2, "width": 256, "plain": True, "batch_size": 256, "learning_rate": 3e-4, "discount": 0.99}
     shared |= {"target_update_rate": 0.005, "updates_per_step": 1, "exploration_scatter": 0, "exploration_color": 0}
-    own = {"td3": {"exploration_std": 0.1, "target_noise": 0.2, "target_noise_clip": 0.5, "policy_delay": 2}}
-    own |= {"sac": {"entropy_per_action": -1}}
+    own = {
+        "td3": {
+            "exploration_std": 0.1,
+            "target_noise": 0.2,
+            "target_noise_clip": 0.5,
+            "policy_delay": 2,
+            "random_steps": 25_000,
+        }
+    }
+    own |= {"sac": {"entropy_per_action": -1, "initial_temperature": 1, "random_steps": 1000}}
     for algorithm in ("td3", "sac"):
         config = agent_config(algorithm, "paper")
         expected = shared | own[algorithm]

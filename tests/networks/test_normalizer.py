@@ -21,9 +21,10 @@ def test_outliers_are_clipped() -> None:
     np.testing.assert_array_equal(scale(jnp.asarray([5.0, -5.0, 0.1])), np.float32([BOUND, -BOUND, 1]))
 
 
-def test_the_identity_only_clips() -> None:
+def test_the_identity_only_clips_or_not_even_that() -> None:
     x = jnp.asarray([0.0, -3.5, 99.0])
     np.testing.assert_array_equal(identity(3)(x), np.float32([0, -3.5, BOUND]))
+    np.testing.assert_array_equal(identity(3, bounded=False)(x), x)
 
 
 def test_soft_bound_is_the_identity_inside_to_the_last_bit() -> None:

@@ -68,15 +68,22 @@ def test_a_gaussian_policy_explores_with_its_own_spread_before_the_tanh(key: jax
         np.testing.assert_allclose(acting(observation), policy.center(seen), atol=2e-5)
 
 
-def test_a_gaussian_policy_s_log_density_is_that_of_its_samples(key: jax.Array) -> None:
-    policy = GaussianPolicy(3, 1, (8, 6), key=key)  # a fresh one is not saturated
-    observation = jnp.ones((200_000, 3))
-    actions, log_density = policy.sample(observation, key=key)
-    counts, edges = np.histogram(actions[:, 0], bins=np.linspace(-1, 1, 21))
-    which = np.digitize(actions[:, 0], edges) - 1
-    for inside in (5, 10, 14):
-        density = np.exp(log_density[which == inside]).mean()
-        assert density == pytest.approx(counts[inside] / len(actions) / 0.1, rel=0.05)
+def test_a_gaussian_policy_s_log_density_is_numpys(key: jax.Array) -> None:
+    policy = gaussian(key)
+    observation = jnp.asarray(np.random.default_rng(3).normal(size=(50, 3)), jnp.float32)
+    features = policy.center.mlp.features(observation)
+    mean, log_std = (np.asarray(head(features), np.float64) for head in (policy.center.mlp.output, policy.spread))
+    std = np.exp(np.clip(log_std, -20, 2))
+    assert std.min() < 0.5 and std.max() > 2  # else its sign would not matter
+    unbounded = mean + std * np.asarray(jax.random.normal(key, mean.shape))
+    normal = -0.5 * ((unbounded - mean) / std) ** 2 - np.log(std * np.sqrt(2 * np.pi))
+    with np.errstate(divide="ignore"):
+        density = np.sum(normal - np.log(1 - np.tanh(unbounded) ** 2), axis=-1)
+    actions, found = policy.sample(observation, key=key)
+    np.testing.assert_allclose(actions, np.tanh(unbounded), atol=1e-5)
+    exact = np.isfinite(density) & (np.abs(unbounded) < 8).all(axis=-1)
+    assert exact.sum() > 25
+    np.testing.assert_allclose(np.asarray(found)[exact], density[exact], rtol=1e-3, atol=1e-3)
 
 
 def test_a_saturated_action_has_a_finite_log_density_and_gradient(key: jax.Array) -> None:
@@ -108,12 +115,13 @@ def test_actions_start_near_zero_and_stay_within_one(key: jax.Array) -> None:
 def test_a_policys_arrays_are_named_float32_and_complete(key: jax.Array) -> None:
     given = arrays(key)
     layers = {f"hidden/{i}/{part}" for i in (0, 1) for part in ("weight", "bias", "scale", "offset")}
-    assert set(given) == {"mean", "std", "output/weight", "output/bias"} | layers
+    assert set(given) == {"mean", "std", "bound", "output/weight", "output/bias"} | layers
     assert {value.dtype for value in given.values()} == {np.dtype(np.float32)}
 
 
 @pytest.mark.parametrize(
-    "missing", ["mean", "std", "output/weight", "output/bias", "hidden/0/weight", "hidden/1/weight", "hidden/0/scale"]
+    "missing",
+    ["mean", "std", "bound", "output/weight", "output/bias", "hidden/0/weight", "hidden/1/weight", "hidden/0/scale"],
 )
 def test_a_missing_array_is_refused(key: jax.Array, missing: str) -> None:
     given = arrays(key)
@@ -151,6 +159,7 @@ MISSHAPEN = {
     "mean of rank 2": ("mean", (1, 3)),
     "mean of another size": ("mean", (4,)),
     "std of another size": ("std", (1,)),
+    "bound with an axis": ("bound", (1,)),
     "transposed layer": ("hidden/1/weight", (6, 8)),
     "layer of rank 1": ("hidden/0/weight", (3,)),
     "scale that would broadcast": ("hidden/0/scale", (1,)),

@@ -55,6 +55,15 @@ def test_each_run_is_a_line_and_their_mean_is_one_more(tmp_path: Path, drawn: li
     assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_link_in_the_place_of_the_picture_is_replaced_and_not_followed(tmp_path: Path, drawn: list[Any]) -> None:
+    (tmp_path / "mine").write_text("precious")
+    (tmp_path / "curve.png").symlink_to(tmp_path / "mine")
+    curves.draw_curves({"mbdpg": [run_with(tmp_path / "a", {0: 1.0})]}, tmp_path / "curve.png", title="")
+    assert (tmp_path / "mine").read_text() == "precious"
+    assert not (tmp_path / "curve.png").is_symlink()
+    assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
+
+
 def test_groups_are_drawn_side_by_side_and_one_without_an_evaluation_is_left_out(
     tmp_path: Path, drawn: list[Any]
 ) -> None:
