@@ -225,7 +225,7 @@ def test_an_unknown_verb_is_answered_with_the_known_ones(say: Any) -> None:
         (("CartPole-v1",), "expected a bounded 1-D Box of floats"),
         (("hostile:Env-v0",), "would run the code of the module hostile; if you trust it, pass --allow-import"),
         (("Pendulum-v1", "--steps", "325"), "--steps is 325, expected a multiple of --cycle, 50"),
-        (("Pendulum-v1", "--steps", "0"), "--steps is 0, expected at least 1"),
+        (("Pendulum-v1", "--steps", "0"), "--steps is 0, expected a number above 0"),
         (("Pendulum-v1", "--width", "0"), "--width is 0"),
         (("Pendulum-v1", "--discount", "1.5"), "--discount is 1.5, expected a number from 0 to 1"),
         (("Pendulum-v1", "--actor-learning-rate", "nan"), "--actor-learning-rate is nan"),

@@ -16,7 +16,7 @@ class Normalizer(eqx.Module):
 
     mean: Float[Array, " observation"]
     std: Float[Array, " observation"]
-    bound: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(BOUND))
+    bound: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(BOUND, jnp.float32))
     """Outliers are clipped at this many standard deviations."""
 
     def __call__(self, observation: Float[Array, "*batch observation"]) -> Float[Array, "*batch observation"]:

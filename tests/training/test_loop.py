@@ -290,7 +290,7 @@ def test_when_all_evaluation_episodes_fail_the_row_has_no_return(
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ({"steps": 0}, "--steps is 0, expected at least 1"),
+        ({"steps": 0}, "--steps is 0, expected a number above 0"),
         ({"cycle": 0}, "cycle is 0"),
         ({"steps": 125}, "--steps is 125, expected a multiple of --cycle, 50"),
         ({"evaluate_every": 30}, "--evaluate-every is 30, expected a multiple"),
