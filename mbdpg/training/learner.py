@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -18,7 +19,15 @@ class Learner:
     """Holds the states of all seeds along a leading `seed` axis and runs k gradient steps per call."""
 
     def __init__(self, agent: Agent, seeds: Sequence[int]):
-        """Initialize every seed's state from its own key."""
+        """Initialize every seed's state from its own key.
+
+        Raises:
+            MemoryError: the states alone are larger than this machine's memory, at which XLA would abort the process.
+        """
+        state = jax.eval_shape(lambda key: agent.init(key=key), jax.random.key(0))
+        size = len(seeds) * sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
+        if size > os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"):
+            raise MemoryError(f"the networks and their optimizers take {size / 2**30:.0f} GiB")
         self.agent = agent
         self._keys = jax.vmap(jax.random.key)(jnp.asarray(seeds, jnp.uint32))
         init_keys = jax.vmap(jax.random.fold_in, (0, None))(self._keys, 0)

@@ -153,6 +153,11 @@ def test_a_snapshot_of_another_width_is_refused_by_the_first_key_that_differs() 
     assert f": {first} is float32[2, 4], expected float32[2, 8]" in str(caught.value)
 
 
+def test_networks_larger_than_the_memory_are_refused_before_xla_aborts() -> None:
+    with pytest.raises(MemoryError, match="GiB"):
+        Learner(make_td3(width=1_000_000), [0])
+
+
 def test_policies_on_the_host_are_the_state_s(two: Two) -> None:
     policies, stds = two.together.behaviors()
     observation = np.array([0.3, -0.7], np.float32)
