@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import os
 import re
 import time
 from collections.abc import Sequence
@@ -267,7 +268,9 @@ def make_demonstrations(flags: Demonstrate) -> None:
 def _benchmark(args: list[str]) -> None:
     flags = parse(Benchmark, "benchmark", args)
     file = flags.json
-    require(file is None or file.absolute().parent.is_dir(), f"--json is {file}, expected a file in an existing folder")
+    if file is not None:
+        fits = os.access(file.absolute().parent, os.W_OK) and not file.is_dir()
+        require(fits, f"--json is {file}, expected a file in a folder that can be written to")
     measured = benchmark.benchmark(lambda line: print(line, flush=True), growth=not flags.quick)
     if file is not None:
         replace_durably(file, json.dumps(measured, indent=2).encode())
