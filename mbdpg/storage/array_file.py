@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -35,7 +36,8 @@ def write_array_file(path: Path, kind: str, arrays: Mapping[str, np.ndarray], fa
     Raises:
         UserError: it cannot be written.
     """
-    text = json.dumps({"format": f"mbdpg-{kind}", "version": 1, "facts": facts}).encode()
+    header = {"format": f"mbdpg-{kind}", "version": 1, "facts": facts, "sha256": _digest(arrays, facts)}
+    text = json.dumps(header).encode()
     data = pack({**arrays, _FACTS: np.frombuffer(text, np.uint8)})
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -65,4 +67,16 @@ def read_array_file(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[
         header.get("facts"), dict
     ):
         raise UserError(f"{path} is {str(header.get('format'))[:40]!r}, expected an mbdpg {kind} file of version 1")
+    if header.get("sha256") != _digest(arrays, header["facts"]):
+        raise UserError(f"{path} has other bytes than it was written with; expected an undamaged mbdpg {kind} file")
     return arrays, header["facts"]
+
+
+def _digest(arrays: Mapping[str, np.ndarray], facts: Mapping[str, Any]) -> str:
+    """SHA-256 of everything in a file, in hexadecimal."""
+    digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name} {array.dtype} {arrays[name].shape} ".encode())
+        digest.update(array.data)
+    return digest.hexdigest()

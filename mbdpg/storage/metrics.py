@@ -218,7 +218,10 @@ def _check_starts(folder: Path, offsets: Mapping[str, Any] | None) -> dict[str, 
         if offsets is None and size > 0:
             raise UserError(f"{path} has rows already; resume the run or choose another --out")
         if type(start) is not int or not 0 <= start <= size:
-            raise UserError(f"cannot resume: {path} has {size} bytes, but the checkpoint was saved at {start!r}")
+            raise UserError(
+                f"cannot resume: {path} has {size} bytes, but the checkpoint was saved at {start!r}; put the file back "
+                "as it was, or begin anew with another --out"
+            )
         if start > 0:
             with path.open("rb") as file:
                 file.seek(start - 1)
