@@ -9,7 +9,7 @@ import numpy as np
 
 from mbdpg import envs
 from mbdpg.experiments import run
-from mbdpg.experiments.config import AgentConfig, RunConfig, algorithm_of
+from mbdpg.experiments.config import AgentConfig, RunConfig
 from mbdpg.experiments.presets import agent_config
 from mbdpg.interfaces import Environment
 from mbdpg.networks.policy import NumpyPolicy
@@ -50,7 +50,6 @@ def train(
     agent = agent_config("mbdpg", "default", env if isinstance(env, str) else None) if config is None else config
     settings = RunConfig(
         env=env if isinstance(env, str) else _name(env) or "environment made in code",
-        algorithm=algorithm_of(agent),
         agent=agent,
         schedule=schedule or Schedule(),
         demonstrations=None if demonstrations is None else str(demonstrations),

@@ -44,7 +44,10 @@ def flag_of(setting: str) -> str:
 def require_settings(
     config: Any, *, positive: Sequence[str] = (), at_most: Mapping[str, float] = {}, signed: Sequence[str] = ()
 ) -> None:
-    """Check a config's choices, and its numbers: above 0, from 0 to a bound, finite, or else at least 0."""
+    """Check a config's choices, and its numbers: above 0, up to a bound, finite, or else at least 0.
+
+    Learning rates are at most 1 and rates of updates at most 1,000: beyond, a typing error is likelier than a purpose.
+    """
     kinds = get_type_hints(type(config))
     for field in dataclasses.fields(config):
         value, kind = getattr(config, field.name), kinds[field.name]
@@ -56,15 +59,15 @@ def require_settings(
         wanted = (int, float) if kind is float else kind
         fits = isinstance(value, wanted) and isinstance(value, bool) == (kind is bool)
         require(fits, f"{flag} is {value!r}, expected {kind.__name__}")
-        if field.name in at_most:
-            bound = at_most[field.name]
-            require(0.0 <= value <= bound, f"{flag} is {value}, expected a number from 0 to {bound:g}")
-        elif field.name in signed:
-            require(math.isfinite(value), f"{flag} is {value}, expected a finite number")
-        elif field.name in positive:
-            require(0.0 < value < math.inf, f"{flag} is {value}, expected a number above 0")
-        else:
-            require(0.0 <= value < math.inf, f"{flag} is {value}, expected a number of at least 0")
+        require(math.isfinite(value), f"{flag} is {value}, expected a finite number")
+        if field.name in signed:
+            continue
+        implied = {"learning_rate": 1.0, "s_per_step": 1000.0}
+        bound = at_most.get(field.name) or next((x for end, x in implied.items() if field.name.endswith(end)), math.inf)
+        fits = value > 0 if field.name in positive else value >= 0
+        least = "above 0" if field.name in positive else "of at least 0" if bound == math.inf else "from 0"
+        most = "" if bound == math.inf else f" to {bound:g}" if field.name not in positive else f", at most {bound:g}"
+        require(fits and value <= bound, f"{flag} is {value}, expected a number {least}{most}")
 
 
 class NonFiniteError(Exception):
@@ -127,6 +130,10 @@ class Batch(NamedTuple):
     """Shape (..., batch, time); 0 before the episode's start and after its end."""
 
 
+Part = Literal["all", "kept", "held-out"]
+"""Which steps of a replay: all, or but for every fifth, or every fifth alone."""
+
+
 class Sampling(NamedTuple):
     """What an update is fed: `batch_size` windows of `burn_in` past steps, then `length` steps from a drawn one."""
 
@@ -135,6 +142,8 @@ class Sampling(NamedTuple):
     length: int
     demonstrated: bool = False
     """Draw from demonstrations alone."""
+    part: Part = "all"
+    """Where the drawn steps are."""
 
 
 class Statistics(NamedTuple):
@@ -154,6 +163,8 @@ class Statistics(NamedTuple):
     """Root mean square of all rewards; the unit of values."""
     progress: Any
     """0 while recent training returns are a random policy's, 1 once they reach the reference return."""
+    steps: Any
+    """How many steps there are."""
 
 
 class Phase(NamedTuple):

@@ -52,6 +52,10 @@ SMALL = ("--width", "8", "--batch-size", "8", "--random-steps", "100", *EVERY_10
 FLAGS = {
     "td3": ("--algorithm", "td3", *SMALL),
     "sac": ("--algorithm", "sac", *SMALL),
+    "mbpo": (
+        *("--algorithm", "mbpo", *SMALL, "--model-width", "8", "--fit-batch-size", "8", "--first-fits", "10"),
+        *("--rollouts-per-step", "2", "--imagine-every", "50", "--retained-steps", "100"),
+    ),
     "mbdpg": (
         *("--algorithm", "mbdpg", *SMALL, "--memory", "8", "--gaussians", "2", "--horizon", "2", "--burn-in", "2"),
         *("--fit-length", "2", "--fit-batch-size", "8", "--pretraining-fits", "10"),

@@ -230,7 +230,7 @@ def test_an_unknown_verb_is_answered_with_the_known_ones(say: Any) -> None:
         (("Pendulum-v1", "--discount", "1.5"), "--discount is 1.5, expected a number from 0 to 1"),
         (("Pendulum-v1", "--actor-learning-rate", "nan"), "--actor-learning-rate is nan"),
         (("Pendulum-v1", "--preset", "big"), "unknown --preset 'big'"),
-        (("Pendulum-v1", "--algorithm", "ppo"), "unknown --algorithm 'ppo'; expected one of mbdpg, td3, sac"),
+        (("Pendulum-v1", "--algorithm", "ppo"), "unknown --algorithm 'ppo'; expected one of mbdpg, td3, sac, mbpo"),
         (("Pendulum-v1", "--seeds", "1", "1"), "--seeds are [1, 1], expected one number or more, all different"),
         (("Pendulum-v1", "--seeds", "-1"), "--seeds are [-1], expected numbers from 0"),
         (("Pendulum-v1", "--max-episode-steps", "0"), "--max-episode-steps is 0"),
@@ -382,6 +382,28 @@ def test_the_last_of_two_algorithms_is_the_one_that_is_trained(say: Any, toys: N
     said = say("train", "Pendulum-v1", "--algorithm", "mbdpg", *TINY, "--out", "run")
     assert said.status == 0, said.err
     assert RunFolder.open(Path("run/seed-0")).config["algorithm"] == "td3"
+
+
+def test_a_run_that_ends_before_it_learns_says_so(say: Any, toys: None) -> None:
+    said = say("train", "Pendulum-v1", *TINY, "--random-steps", "40", "--out", "run")
+    assert said.status == 0
+    assert said.err.startswith("mbdpg: nothing will be learned: all 40 --steps are --random-steps (40)\n")
+    assert "nothing" not in say("train", "Pendulum-v1", *TINY, "--random-steps", "39", "--out", "other").err
+
+
+def test_a_finished_run_is_said_to_be_so_on_resume(say: Any, trained: Path) -> None:
+    said = say("resume", trained)
+    assert said.status == 0 and f"{trained} has its 400 steps already; --steps makes it longer" in said.out
+
+
+def test_the_next_line_can_be_pasted_where_the_program_is_not_on_the_path(
+    say: Any, toys: None, monkeypatch: Any
+) -> None:
+    monkeypatch.setattr(sys, "argv", [".venv/bin/mbdpg"])
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    assert "next: .venv/bin/mbdpg evaluate run/seed-0" in say("train", "Pendulum-v1", *TINY, "--out", "run").out
+    monkeypatch.setattr(shutil, "which", lambda name: "/usr/bin/mbdpg")
+    assert "next: mbdpg evaluate other/seed-0" in say("train", "Pendulum-v1", *TINY, "--out", "other").out
 
 
 # Through the real program, once.

@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import io
 import re
+import shutil
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import tyro
@@ -34,6 +36,12 @@ def peek(args: Sequence[str], flag: str, default: str) -> str:
         elif arg.startswith(f"--{flag}="):
             found = arg.split("=", 1)[1]
     return found
+
+
+def program() -> str:
+    """What to type for this program where it was started."""
+    called = Path(sys.argv[0])
+    return str(called) if called.name == "mbdpg" and not shutil.which("mbdpg") else "mbdpg"
 
 
 def one_line(text: str) -> str:

@@ -11,17 +11,17 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
 
 from mbdpg import envs
 from mbdpg.cli.compilations import keep_compilations
-from mbdpg.cli.flags import parse, peek
+from mbdpg.cli.flags import parse, peek, program
 from mbdpg.cli.stopping import Stop
 from mbdpg.experiments import benchmark, expert, presets
-from mbdpg.experiments.config import AgentConfig, Algorithm, EnvOptions, RunConfig
+from mbdpg.experiments.config import AgentConfig, EnvOptions, RunConfig
 from mbdpg.experiments.run import load_policy, resume, train
 from mbdpg.interfaces import require
 from mbdpg.reports.console import RunDisplay
@@ -40,7 +40,7 @@ RunArgument = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")
 class RunOptions:
     """What is run."""
 
-    algorithm: Algorithm = "mbdpg"
+    algorithm: Literal["mbdpg", "td3", "sac", "mbpo"] = "mbdpg"
     """Algorithm to train."""
     preset: presets.Preset = "default"
     """Settings that measured best, or those published; other flags change single ones."""
@@ -143,7 +143,7 @@ def _train_flags(args: list[str], preset: str, agent: AgentConfig) -> Any:
 
 
 def _train(args: list[str]) -> None:
-    algorithm: Any = peek(args, "algorithm", "mbdpg")
+    algorithm = peek(args, "algorithm", "mbdpg")
     preset = peek(args, "preset", "default")
     agent = presets.agent_config(algorithm, preset, args[0] if args else None)
     flags = _train_flags(args, preset, agent)
@@ -151,7 +151,7 @@ def _train(args: list[str]) -> None:
     if own != agent:  # the task's id stands elsewhere
         flags = _train_flags(args, preset, own)
     keep_compilations()
-    config = RunConfig(flags.env, algorithm, flags.agent, flags.schedule, flags.env_options)
+    config = RunConfig(flags.env, flags.agent, flags.schedule, flags.env_options)
     name = re.sub(r"[^A-Za-z0-9.-]+", "-", flags.env)
     out = flags.run.out or Path("runs") / f"{name}-{algorithm}-{time.strftime('%Y%m%d-%H%M%S')}"
     if flags.run.demonstrations == "expert":
@@ -163,7 +163,7 @@ def _train(args: list[str]) -> None:
     with Stop() as stop:
         with RunDisplay(config.schedule.steps) as display:
             runs = train(config, seeds=flags.run.seeds, out=out, on_update=display, should_stop=stop)
-        stop.exit_if_asked(f"mbdpg resume {out}")
+        stop.exit_if_asked(f"{program()} resume {out}")
     _finish(runs, algorithm, config.env)
 
 
@@ -172,7 +172,7 @@ def _finish(runs: Sequence[Path], algorithm: str, env: str) -> None:
     folder = runs[0].parent
     draw_curves({algorithm: runs}, folder / "learning-curve.png", title=env)
     print(f"done: {folder}, learning curve in {folder / 'learning-curve.png'}")
-    print(f"next: mbdpg evaluate {runs[0]} --episodes 10 --video {folder / 'policy.mp4'}")
+    print(f"next: {program()} evaluate {runs[0]} --episodes 10 --video {folder / 'policy.mp4'}")
 
 
 def _resume(args: list[str]) -> None:
@@ -185,11 +185,15 @@ def _resume(args: list[str]) -> None:
         for run in runs:
             with contextlib.ExitStack() as stack:
 
-                def display(config: RunConfig, env_steps: int, stack: contextlib.ExitStack = stack) -> RunDisplay:
+                def display(
+                    config: RunConfig, env_steps: int, run: Path = run, stack: contextlib.ExitStack = stack
+                ) -> RunDisplay:
+                    if env_steps >= config.schedule.steps:
+                        print(f"{run} has its {env_steps:,} steps already; --steps makes it longer")
                     return stack.enter_context(RunDisplay(config.schedule.steps, done=env_steps))
 
                 resume(run, steps=flags.steps, allow_import=flags.allow_import, watch=display, should_stop=stop)
-            stop.exit_if_asked(f"mbdpg resume {flags.run}")
+            stop.exit_if_asked(f"{program()} resume {flags.run}")
     config = RunFolder.open(runs[0]).config
     _finish(runs, config["algorithm"], config["env"])
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -91,44 +91,36 @@ class Start(NamedTuple):
     observation: Float[Array, "batch observation"]
     memory: Memory
     weight: Float[Array, " batch"]
-    """Probability that the episode goes on here."""
+    """Probability that the episode goes on here; 0 where nothing may start."""
     depth: Float[Array, " batch"]
     """Imagined steps since a real state; 0 at a real one."""
 
 
-class ImaginationBuffer(NamedTuple):
-    """D_model of Algorithm 1: imagined states from which further imagination may start; a ring."""
+class Ring(NamedTuple):
+    """D_model of Algorithm 1: what was imagined last; new rows overwrite the oldest."""
 
-    observation: Float[Array, "slot observation"]
-    memory: Memory
-    weight: Float[Array, " slot"]
-    """Probability of being alive there."""
-    depth: Float[Array, " slot"]
-    """Imagined steps between the last real state and this one."""
+    rows: Any
+    """A pytree of arrays with a leading `slot` axis; zeros where nothing has been added yet."""
     added: Int[Array, ""]
-    """States ever added."""
+    """Rows ever added."""
 
     @classmethod
-    def empty(cls, slots: int, observation_size: int, memory: Memory) -> ImaginationBuffer:
-        """No states; `memory` is one of shape (slots, memory)."""
-        return cls(
-            jnp.zeros((slots, observation_size)), memory, jnp.zeros(slots), jnp.zeros(slots), jnp.zeros((), jnp.int32)
-        )
+    def empty(cls, slots: int, row: Any) -> Ring:
+        """Room for `slots` rows like the given one."""
+        return cls(jax.tree.map(lambda x: jnp.zeros((slots, *x.shape), x.dtype), row), jnp.zeros((), jnp.int32))
 
-    def add(self, observation: Array, memory: Memory, weight: Array, depth: Array) -> ImaginationBuffer:
-        """Overwrite the oldest states with a batch of new ones; the batch divides the number of slots."""
-        slots, batch = self.weight.shape[0], weight.shape[0]
+    def add(self, rows: Any) -> Ring:
+        """Overwrite the oldest rows with a batch of new ones, whose number divides that of the slots."""
+        slots, batch = (jax.tree.leaves(x)[0].shape[0] for x in (self.rows, rows))
         at = jnp.mod(self.added, slots)
-        new = ImaginationBuffer(observation, memory, weight, depth, self.added)
 
-        def write(old: Array, fresh: Array) -> Array:
-            return fresh if old.ndim == 0 else jax.lax.dynamic_update_slice_in_dim(old, fresh, at, axis=0)
+        def write(old: Array, new: Array) -> Array:
+            return jax.lax.dynamic_update_slice_in_dim(old, new, at, axis=0)
 
-        return jax.tree.map(write, self, new)._replace(added=self.added + batch)
+        return Ring(jax.tree.map(write, self.rows, rows), self.added + batch)
 
-    def sample(self, batch: int, *, key: PRNGKeyArray) -> Start:
-        """States drawn uniformly; weight 0 while there are none."""
-        filled = jnp.minimum(self.added, self.weight.shape[0]).astype(jnp.float32)
-        rows = (jax.random.uniform(key, (batch,)) * filled).astype(jnp.int32)
-        memory = Memory(self.memory.hidden[rows], self.memory.cell[rows])
-        return Start(self.observation[rows], memory, self.weight[rows], self.depth[rows])
+    def sample(self, batch: int, *, key: PRNGKeyArray) -> Any:
+        """Rows drawn uniformly from those added; zeros while there are none."""
+        filled = jnp.minimum(self.added, jax.tree.leaves(self.rows)[0].shape[0]).astype(jnp.float32)
+        drawn = (jax.random.uniform(key, (batch,)) * filled).astype(jnp.int32)
+        return jax.tree.map(lambda x: x[drawn], self.rows)

@@ -6,28 +6,22 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 from mbdpg import envs
-from mbdpg.agents import mbdpg, sac, td3
+from mbdpg.agents import mbdpg, mbpo, sac, td3
 from mbdpg.interfaces import require
 from mbdpg.training.loop import Schedule
 
-Algorithm = Literal["mbdpg", "td3", "sac"]
-AgentConfig = mbdpg.Config | td3.Config | sac.Config
+AgentConfig = mbdpg.Config | td3.Config | sac.Config | mbpo.Config
 
-CONFIGS: dict[str, type[AgentConfig]] = {"mbdpg": mbdpg.Config, "td3": td3.Config, "sac": sac.Config}
-
-
-def algorithm_of(agent: AgentConfig) -> Algorithm:
-    """The name of the algorithm that these are settings of."""
-    match agent:
-        case mbdpg.Config():
-            return "mbdpg"
-        case td3.Config():
-            return "td3"
-        case sac.Config():
-            return "sac"
+CONFIGS: dict[str, type[AgentConfig]] = {
+    "mbdpg": mbdpg.Config,
+    "td3": td3.Config,
+    "sac": sac.Config,
+    "mbpo": mbpo.Config,
+}
+"""By the name of the algorithm that they are settings of."""
 
 
 @dataclass(frozen=True)
@@ -54,12 +48,21 @@ class RunConfig:
 
     env: str
     """Gymnasium id, or a name for an environment made in code."""
-    algorithm: Algorithm = "mbdpg"
     agent: AgentConfig = field(default_factory=mbdpg.Config)
+    """Its type says which algorithm."""
     schedule: Schedule = field(default_factory=Schedule)
     env_options: EnvOptions = field(default_factory=EnvOptions)
     demonstrations: str | None = None
     """File of demonstrations to begin with."""
+
+    @property
+    def algorithm(self) -> str:
+        """Its name."""
+        return next(name for name, config in CONFIGS.items() if type(self.agent) is config)
+
+    def to_json(self) -> dict[str, Any]:
+        """What `from_json` reads."""
+        return {"algorithm": self.algorithm} | dataclasses.asdict(self)
 
     def make_env(self, *, render: bool = False) -> envs.GymnasiumEnvironment:
         """The environment, from Gymnasium's registry."""
@@ -91,7 +94,6 @@ class RunConfig:
         require(demonstrations is None or isinstance(demonstrations, str), "config.json has odd demonstrations")
         return cls(
             env=str(env),
-            algorithm=algorithm,  # type: ignore[arg-type]  # checked above
             agent=_settings(CONFIGS[algorithm], data.get("agent"), "agent"),  # type: ignore[index]
             schedule=_settings(Schedule, data.get("schedule"), "schedule"),
             env_options=_settings(EnvOptions, data.get("env_options"), "env_options"),

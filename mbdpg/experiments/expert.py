@@ -16,7 +16,7 @@ from mbdpg.training.loop import Schedule
 
 def config_of(env: str, steps: int, env_options: EnvOptions) -> RunConfig:
     """The expert's training: TD3 for `steps` environment steps."""
-    return RunConfig(env, "td3", agent_config("td3", "default"), Schedule(steps=steps), env_options)
+    return RunConfig(env, agent_config("td3", "default"), Schedule(steps=steps), env_options)
 
 
 def success_in(env: str, env_options: EnvOptions, given: float | None) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from mbdpg.envs import OLD_IDS
 from mbdpg.experiments.config import CONFIGS, AgentConfig, EnvOptions
@@ -44,12 +44,25 @@ PAPER: dict[str, dict[str, Any]] = {
     # The authors' own code: sfujim/TD3 and rail-berkeley/softlearning.
     "td3": {"layers": 2, "plain": True, "random_steps": 25_000},
     "sac": {"layers": 2, "plain": True, "random_steps": 1000},
+    # jannerm/mbpo.
+    "mbpo": {"layers": 2, "plain": True, "random_steps": 5000, "updates_per_step": 20.0, "fits_per_step": 2.0},
 }
 
-TASKS: dict[str, dict[str, dict[str, Any]]] = {
+TASKS: dict[str, dict[str, dict[str, dict[str, Any]]]] = {
     # What a task wants otherwise than the default; each is one more thing to know, and has its numbers in the notebook.
-    "mbdpg": {
-        "LunarLanderContinuous-v3": {"trace": 1.0},  # 21: below 1 it hovers and never meets the ground
+    "default": {
+        "mbdpg": {
+            "LunarLanderContinuous-v3": {"trace": 1.0},  # 21: below 1 it hovers and never meets the ground
+        },
+    },
+    # What the authors set for the task: jannerm/mbpo, examples/config.
+    "paper": {
+        "mbpo": {
+            "Hopper-v5": {"final_rollout_length": 15, "entropy_per_action": -1 / 3},
+            "HalfCheetah-v5": {"updates_per_step": 40.0, "entropy_per_action": -0.5},
+            "Walker2d-v5": {"entropy_per_action": -0.5},
+            "Ant-v5": {"final_rollout_length": 25, "lengthen_until": 100_000, "entropy_per_action": -0.5},
+        },
     },
 }
 
@@ -59,11 +72,11 @@ PAPER_EPISODE_LIMIT = 1000
 
 
 def agent_config(algorithm: str, preset: str, env: str | None = None) -> AgentConfig:
-    """The algorithm's settings under a preset; the default one has values of their own for some tasks."""
+    """The algorithm's settings under a preset, which has values of their own for some tasks."""
     require(algorithm in CONFIGS, f"unknown --algorithm {algorithm!r}; expected one of {', '.join(CONFIGS)}")
-    require(preset in ("default", "paper"), f"unknown --preset {preset!r}; expected default or paper")
-    own = TASKS.get(algorithm, {}).get(OLD_IDS.get(env, env), {}) if env else {}
-    return CONFIGS[algorithm](**(PAPER[algorithm] if preset == "paper" else own))
+    require(preset in get_args(Preset), f"unknown --preset {preset!r}; expected {' or '.join(get_args(Preset))}")
+    own = TASKS[preset].get(algorithm, {}).get(OLD_IDS.get(env, env), {}) if env else {}
+    return CONFIGS[algorithm](**((PAPER[algorithm] if preset == "paper" else {}) | own))
 
 
 def run_settings(preset: str) -> tuple[Schedule, EnvOptions]:

@@ -7,20 +7,17 @@ import dataclasses
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from mbdpg.agents import mbdpg, sac, td3
+from mbdpg.agents import mbdpg, mbpo, sac, td3
 from mbdpg.experiments.config import RunConfig
+from mbdpg.experiments.recorder import Recorder
 from mbdpg.imitation.demonstrations import Demonstrations
-from mbdpg.interfaces import Agent, Environment, EnvSpec, Metrics, UserError, require
+from mbdpg.interfaces import Agent, Environment, EnvSpec, UserError, require
 from mbdpg.networks.policy import NumpyPolicy
-from mbdpg.storage.array_file import read_array_file, write_array_file
-from mbdpg.storage.checkpoint import Checkpoint, CheckpointWriter, load_checkpoint
-from mbdpg.storage.metrics import MetricsLog
+from mbdpg.storage.array_file import read_array_file
+from mbdpg.storage.checkpoint import Checkpoint, load_checkpoint
 from mbdpg.storage.run_folder import RunFolder, describe_machine
 from mbdpg.training.collector import Collector
 from mbdpg.training.learner import Learner
@@ -62,14 +59,20 @@ def train(
     make = make_env or config.make_env
     spec = _spec_of(make)
     demonstrations = Demonstrations.load(Path(config.demonstrations), spec) if config.demonstrations else None
-    description = dataclasses.asdict(config) | {"commit": _commit(), "machine": describe_machine()}
+    if config.schedule.steps <= config.agent.random_steps:
+        print(
+            f"mbdpg: nothing will be learned: all {config.schedule.steps:,} --steps are --random-steps "
+            f"({config.agent.random_steps:,})",
+            file=sys.stderr,
+        )
+    description = config.to_json() | {"commit": _commit(), "machine": describe_machine()}
     folders: list[RunFolder] = []
     with contextlib.ExitStack() as undo, contextlib.ExitStack() as stack:
         for seed in seeds:
             facts = {"seed": seed, "custom_env": make_env is not None}
             folders.append(RunFolder.create(out / f"seed-{seed}", description | facts, undo=undo))
             stack.enter_context(folders[-1].locked())
-        training = _compose(config, spec, make, seeds, [_Recorder(folder) for folder in folders], stack, demonstrations)
+        training = _compose(config, spec, make, seeds, [Recorder(folder) for folder in folders], stack, demonstrations)
         training.save()
         undo.pop_all()  # from here on, there is something to go on from
         training.run(on_update, should_stop)
@@ -99,7 +102,10 @@ def resume(
         UserError: not a run, damaged beyond its checkpoints, or of another configuration or environment.
     """
     folder = RunFolder.open(path)
-    config = RunConfig.from_json(folder.config)
+    try:
+        config = RunConfig.from_json(folder.config)
+    except UserError as error:
+        raise UserError(f"{path} cannot be resumed, {error}; put its config.json back as it was") from error
     config = dataclasses.replace(config, env_options=dataclasses.replace(config.env_options, allow_import=allow_import))
     if folder.config.get("custom_env") and make_env is None:
         raise UserError(f"{path} trained an environment made in code; resume it with mbdpg.resume(..., env=...)")
@@ -115,7 +121,7 @@ def resume(
             )
             schedule = dataclasses.replace(config.schedule, steps=planned if steps is None else steps)
             config = dataclasses.replace(config, schedule=schedule)
-            recorders = [_Recorder(folder, checkpoint)]
+            recorders = [Recorder(folder, checkpoint)]
             training = _compose(config, spec, make, [_seed_of(folder)], recorders, stack, None, checkpoint)
         except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise UserError(
@@ -153,43 +159,6 @@ def policy_facts(path: Path) -> dict[str, Any]:
     return read_array_file(path / "policy" / "latest.safetensors", "policy")[1]
 
 
-class _Recorder:
-    """Writes one seed's run folder."""
-
-    def __init__(self, folder: RunFolder, checkpoint: Checkpoint | None = None):
-        facts = checkpoint.facts["recorder"] if checkpoint else {"offsets": None, "best": None}
-        self._folder = folder.path
-        self._offsets = facts["offsets"]
-        self._checkpoints = CheckpointWriter(folder.path)
-        self._policies = folder.path / "policy"
-        self._best: float | None = facts["best"]
-
-    @cached_property
-    def _log(self) -> MetricsLog:
-        """Opened with the first row, because that cuts off all rows after the checkpoint: nothing may fail then."""
-        return MetricsLog(self._folder, offsets=self._offsets)
-
-    def write(self, kind: str, env_steps: int, values: Metrics) -> None:
-        self._log.write(kind, env_steps, values)
-
-    def save_policy(self, arrays: dict[str, np.ndarray], env_steps: int, return_mean: float) -> None:
-        facts = {"env_steps": env_steps, "return_mean": return_mean}
-        write_array_file(self._policies / "latest.safetensors", "policy", arrays, facts)
-        if np.isfinite(return_mean) and (self._best is None or return_mean > self._best):
-            self._best = return_mean
-            write_array_file(self._policies / "best.safetensors", "policy", arrays, facts)
-
-    def save_checkpoint(
-        self, env_steps: int, arrays: dict[str, np.ndarray], facts: dict[str, Any], replay: dict[str, np.ndarray]
-    ) -> None:
-        facts = facts | {"recorder": {"offsets": self._log.offsets(), "best": self._best}}
-        self._checkpoints.save(env_steps=env_steps, arrays=arrays, facts=facts, replay=replay)
-
-    def close(self) -> None:
-        if "_log" in vars(self):  # else closing would be what opens it
-            self._log.close()
-
-
 def make_agent(config: RunConfig, spec: EnvSpec) -> Agent:
     """The agent that the config's type names."""
     match config.agent:
@@ -197,6 +166,8 @@ def make_agent(config: RunConfig, spec: EnvSpec) -> Agent:
             return mbdpg.MBDPG(config.agent, spec)
         case td3.Config():
             return td3.TD3(config.agent, spec)
+        case mbpo.Config():  # before SAC's, which they are too
+            return mbpo.MBPO(config.agent, spec)
         case sac.Config():
             return sac.SAC(config.agent, spec)
 
@@ -206,7 +177,7 @@ def _compose(
     spec: EnvSpec,
     make: MakeEnvironment,
     seeds: Sequence[int],
-    recorders: Sequence[_Recorder],
+    recorders: Sequence[Recorder],
     stack: contextlib.ExitStack,
     demonstrations: Demonstrations | None,
     checkpoint: Checkpoint | None = None,
@@ -273,7 +244,8 @@ def _spec_of(make: MakeEnvironment) -> EnvSpec:
 
 def _seed_of(folder: RunFolder) -> int:
     seed = folder.config.get("seed")
-    require(isinstance(seed, int) and 0 <= seed < 2**31, f"{folder.path} has seed {seed!r} in its config.json")
+    fits = isinstance(seed, int) and 0 <= seed < 2**31
+    require(fits, f"{folder.path} has seed {seed!r} in its config.json, expected a number from 0 to 2^31 - 1")
     return int(seed)  # type: ignore[arg-type]  # checked above
 
 

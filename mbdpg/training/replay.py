@@ -11,6 +11,8 @@ from mbdpg.interfaces import Batch, Sampling, Statistics, UserError
 CONSTANT = 1e-6
 """An observation entry with a smaller standard deviation never changes (Ant's unused contact forces)."""
 
+HELD_OUT = 5
+"""Every so many-th step is held out from learning where an agent asks for it."""
 
 LARGEST = float(np.finfo(np.float32).max)
 
@@ -123,7 +125,14 @@ class Replay:
     def sample(self, updates: int, sampling: Sampling, rng: np.random.Generator) -> Batch:
         """Draw windows around uniformly drawn steps: arrays of shape (updates, batch, burn_in + length, ...)."""
         rows = self.demonstrated if sampling.demonstrated else self.size
-        return self.windows(rng.integers(0, rows, (updates, sampling.batch_size)), sampling)
+        held_out = rows // HELD_OUT
+        count = {"all": rows, "kept": rows - held_out, "held-out": max(held_out, 1)}[sampling.part]
+        drawn = rng.integers(0, count, (updates, sampling.batch_size))
+        if sampling.part == "kept":
+            drawn += drawn // (HELD_OUT - 1)
+        elif sampling.part == "held-out":
+            drawn = np.minimum(drawn * HELD_OUT + HELD_OUT - 1, rows - 1)
+        return self.windows(drawn, sampling)
 
     def windows(self, row: np.ndarray, sampling: Sampling) -> Batch:
         """The steps around each given row; those outside its episode repeat the row itself and are not `valid`."""
@@ -212,6 +221,7 @@ class _Moments:
             terminal_reward_scale=np.float32(terminal if terminal > CONSTANT else 1.0),
             return_scale=_spread(np.asarray(self._reward[0] / n)),
             progress=np.float32(progress),
+            steps=np.float32(self._count),
         )
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from mbdpg.agents.mbdpg import MBDPG, Config, State
+from mbdpg.dynamics.imagination import Ring
 from mbdpg.interfaces import Batch, EnvSpec, Statistics
 from mbdpg.training.replay import Replay
 
@@ -71,7 +72,7 @@ def state() -> State:
 
 
 def statistics(progress: float = 0.25) -> Statistics:
-    numbers = ([0.1, -0.2, 0.3], [1.0, 2.0, 0.5], [0.2, 1.0, 0.25], 0.8, 5.0, 2.0, progress)
+    numbers = ([0.1, -0.2, 0.3], [1.0, 2.0, 0.5], [0.2, 1.0, 0.25], 0.8, 5.0, 2.0, progress, 100.0)
     return Statistics(*(jnp.asarray(x, jnp.float32) for x in numbers))
 
 
@@ -312,15 +313,15 @@ def test_imagination_goes_on_from_the_buffer_up_to_its_depth() -> None:
     for i in range(8):
         current, _ = update("improve", settings)(current, ended, i)
         rows = slice(i * BATCH, (i + 1) * BATCH)
-        depths.append(np.asarray(current.imagined.depth[rows]))
-        alive = np.asarray(current.imagined.weight[rows] > 0)
+        depths.append(np.asarray(current.imagined.rows.depth[rows]))
+        alive = np.asarray(current.imagined.rows.weight[rows] > 0)
         assert (alive == (depths[-1] <= PAPER["imagination_depth"]) & (np.arange(BATCH) != 3)).all()
     depths = np.stack(depths)
     assert (depths[0] == 2).all()  # the buffer was empty: all from real states
     assert (depths[:, 2:] == 2).all()  # the half that always starts there
     # Started from depth 2 they reach 4 and may be started from again; from 4 they reach 6, too deep to be.
     assert set(depths[:, :2].ravel()) == {2, 4, 6}
-    assert float(current.imagined.added) == 8 * BATCH and finite(current.imagined)
+    assert int(current.imagined.added) == 8 * BATCH and finite(current.imagined)
 
 
 def test_a_share_of_one_imagines_from_real_states_only_while_the_buffer_is_empty() -> None:
@@ -328,7 +329,8 @@ def test_a_share_of_one_imagines_from_real_states_only_while_the_buffer_is_empty
     window = one._normalized(state(), jax.tree.map(jnp.asarray, BATCHES["improve"]))
     start = jax.jit(lambda s: one._start(s, window, key=jax.random.key(0)))
     np.testing.assert_array_equal(start(state()).observation, window.next_observation[:, -1])
-    full = state().imagined._replace(added=jnp.float32(32), weight=jnp.full(32, 0.5), depth=jnp.full(32, 2.0))
+    rows = state().imagined.rows._replace(weight=jnp.full(32, 0.5), depth=jnp.full(32, 2.0))
+    full = Ring(rows, jnp.int32(32))
     started = start(eqx.tree_at(lambda x: x.imagined, state(), full))
     assert (started.depth == 2).all() and (started.weight == 0.5).all() and not started.observation.any()
 

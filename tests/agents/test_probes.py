@@ -12,16 +12,26 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mbdpg.agents import mbdpg, sac, td3
+from mbdpg.agents import mbdpg, mbpo, sac, td3
 from mbdpg.dynamics import mixture
 from mbdpg.interfaces import Agent, Batch, EnvSpec
 
 ROWS, STEPS, BATCH, UPDATES, GAMMA = 512, 3, 32, 800, 0.5
 ENV = EnvSpec("probe", observation_size=1, action_size=1, episode_limit=None, reference_return=None)
 NETWORKS = {"width": 16, "batch_size": BATCH, "discount": GAMMA, "target_update_rate": 0.1}
+SOFT = {"learning_rate": 3e-3, "entropy_per_action": -9.0, "initial_temperature": 1e-3}
 AGENTS: dict[str, Agent] = {
     "td3": td3.TD3(td3.Config(**NETWORKS, learning_rate=3e-3, target_noise=0.0), ENV),
-    "sac": sac.SAC(sac.Config(**NETWORKS, learning_rate=3e-3, entropy_per_action=-9.0, initial_temperature=1e-3), ENV),
+    "sac": sac.SAC(sac.Config(**NETWORKS, **SOFT), ENV),
+    # Half of its steps are real: imagination has the policy's actions alone, and probes ask for others too.
+    "mbpo": mbpo.MBPO(
+        mbpo.Config(
+            **{**NETWORKS, **SOFT, "real_share": 0.5, "members": 3, "elites": 2, "model_width": 16},
+            **{"model_learning_rate": 3e-3, "fit_batch_size": BATCH, "rollouts_per_step": 32, "imagine_every": 1},
+            retained_steps=20,
+        ),
+        ENV,
+    ),
     "mbdpg": mbdpg.MBDPG(
         mbdpg.Config(
             **NETWORKS,
@@ -60,13 +70,13 @@ def experience(probe: Probe, starts: list[float]) -> Batch:
 def learn(request: pytest.FixtureRequest) -> Callable[[Probe, list[float]], Learned]:
     """Train an agent on a probe; compiled once for all of them."""
     agent = AGENTS[request.param]
-    phases = [phase for phase in agent.phases if phase.name in ("fitting", "improving")]
+    phases = [phase for phase in agent.phases if phase.name in ("fitting", "validating", "imagining", "improving")]
 
     @jax.jit
     def train(windows: Batch, key: jax.Array):
         def step(state, key):
             for i, phase in enumerate(phases):
-                rows = jax.random.randint(jax.random.fold_in(key, i), (BATCH,), 0, ROWS)
+                rows = jax.random.randint(jax.random.fold_in(key, i), (phase.sampling.batch_size,), 0, ROWS)
                 length = phase.sampling.burn_in + phase.sampling.length
                 batch = jax.tree.map(lambda x, rows=rows, length=length: x[rows, :length], windows)
                 state, _ = phase.update(state, batch, key=key)
@@ -83,8 +93,9 @@ def learn(request: pytest.FixtureRequest) -> Callable[[Probe, list[float]], Lear
             # Where nothing is random the likelihood's gradient grows by the hundred and starves the reward's.
             patch.setattr(mixture, "LOG_STD_MIN", -1.0)
             state = train(experience(probe, starts), jax.random.key(0))
+        critics = state.soft.critics if isinstance(state, mbpo.State) else state.critics
         return Learned(
-            value=lambda observation, action: float(jnp.min(state.critics(one(observation), one(action)))),
+            value=lambda observation, action: float(jnp.min(critics(one(observation), one(action)))),
             action=lambda observation: float(agent.policy(state)[0](one(observation))[0]),
         )
 

@@ -16,7 +16,10 @@ O, A, BATCH, GAMMA = 3, 2, 6, 0.9
 ENV = EnvSpec("made-in-code", observation_size=O, action_size=A, episode_limit=None, reference_return=None)
 LEARNED = {"actor", "critics", "log_temperature"}
 STATISTICS = Statistics(
-    *(jnp.asarray(x, jnp.float32) for x in ([0.1, -0.2, 0.3], [1.0, 2.0, 0.5], [0.2, 1.0, 0.25], 0.8, 5.0, 2.0, 0.0))
+    *(
+        jnp.asarray(x, jnp.float32)
+        for x in ([0.1, -0.2, 0.3], [1.0, 2.0, 0.5], [0.2, 1.0, 0.25], 0.8, 5.0, 2.0, 0.0, 100.0)
+    )
 )
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import mbdpg
-from mbdpg.agents import mbdpg as model_based, sac, td3
+from mbdpg.agents import mbdpg as model_based, mbpo, sac, td3
 from mbdpg.interfaces import UserError
 from mbdpg.training.loop import Schedule
 
@@ -18,7 +18,7 @@ SHARES = [("discount", 1.01), ("discount", -0.1), ("discount", float("nan")), ("
 SHARES += [("exploration_scatter", 1.5)]
 IMPOSSIBLE = [
     *((model_based.Config, name, value) for name, value in SHARES),
-    *((config, name, value) for config in (td3.Config, sac.Config) for name, value in SHARES),
+    *((config, name, value) for config in (td3.Config, sac.Config, mbpo.Config) for name, value in SHARES),
     (model_based.Config, "horizon", 0),
     (model_based.Config, "batch_size", -1),
     (model_based.Config, "trace", -0.1),
@@ -37,12 +37,18 @@ IMPOSSIBLE = [
     (model_based.Config, "gaussians", 0),
     (model_based.Config, "saturation_penalty", -1e-3),
     (td3.Config, "policy_delay", 0),
+    (td3.Config, "updates_per_step", 1e12),
+    (model_based.Config, "critic_learning_rate", 1e30),
     (td3.Config, "target_noise", -0.1),
     (td3.Config, "width", 0),
     (td3.Config, "layers", 0),
     (sac.Config, "layers", 0),
     (sac.Config, "learning_rate", 0.0),
     (sac.Config, "entropy_per_action", float("inf")),
+    (mbpo.Config, "real_share", 1.5),
+    (mbpo.Config, "elites", 8),
+    (mbpo.Config, "rollout_length", 0),
+    (mbpo.Config, "lengthen_from", 150_000),
 ]
 
 
@@ -81,9 +87,14 @@ def unread(config: type, files: list[Path], owners: set[str]) -> set[str]:
         ),
         (td3.Config, [PACKAGE / "agents" / "td3.py", COMPOSED], {"c", "config", "agent"}),
         (sac.Config, [PACKAGE / "agents" / "sac.py", COMPOSED], {"c", "config", "agent"}),
+        (
+            mbpo.Config,
+            [*((PACKAGE / "agents" / f"{name}.py") for name in ("sac", "mbpo")), COMPOSED],
+            {"c", "config", "agent"},
+        ),
         (Schedule, [PACKAGE / "training" / "loop.py"], {"schedule", "_schedule"}),
     ],
-    ids=["mbdpg", "td3", "sac", "schedule"],
+    ids=["mbdpg", "td3", "sac", "mbpo", "schedule"],
 )
 def test_every_setting_is_read(config: type, files: list[Path], owners: set[str]) -> None:
     assert not unread(config, files, owners)

@@ -46,7 +46,7 @@ def state() -> State:
         return x.actor, x.critics, x.target_actor, x.target_critics
 
     moved = jax.tree.map(lambda x: x + jnp.asarray(rng.normal(0, 0.2, x.shape), jnp.float32), networks(fresh()))
-    numbers = ([0.1, -0.2, 0.3], [1.0, 2.0, 0.5], [0.2, 1.0, 0.25], 0.8, 5.0, 2.0, 0.0)
+    numbers = ([0.1, -0.2, 0.3], [1.0, 2.0, 0.5], [0.2, 1.0, 0.25], 0.8, 5.0, 2.0, 0.0, 100.0)
     statistics = Statistics(*(jnp.asarray(x, jnp.float32) for x in numbers))
     return agent().prepare(eqx.tree_at(networks, fresh(), moved), statistics)
 

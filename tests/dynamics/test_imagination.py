@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mbdpg.dynamics.imagination import UNROLLED, ImaginationBuffer, Trajectory, imagine
+from mbdpg.dynamics.imagination import UNROLLED, Ring, Start, Trajectory, imagine
 from mbdpg.dynamics.mixture import Memory, MixtureDynamics, Scales, next_observation
 from mbdpg.networks.policy import Policy
 
@@ -128,47 +128,49 @@ def test_the_gradient_passes_the_policy_only_where_it_is_not_detached() -> None:
     assert not np.allclose(detached[1].mlp.output.bias, full[1].mlp.output.bias, atol=1e-4)
 
 
-def buffer(slots: int = 6) -> ImaginationBuffer:
-    return ImaginationBuffer.empty(slots, O, Memory(jnp.zeros((slots, MEMORY)), jnp.zeros((slots, MEMORY))))
+def ring(slots: int = 6) -> Ring:
+    return Ring.empty(slots, Start(jnp.zeros(O), Memory(jnp.zeros(MEMORY), jnp.zeros(MEMORY)), *jnp.zeros(2)))
 
 
-def batch_of(value: float, size: int = 2) -> tuple[jax.Array, Memory, jax.Array, jax.Array]:
+def batch_of(value: float, size: int = 2) -> Start:
     """A batch in which every number tells which batch it was."""
     full = jnp.full((size, MEMORY), value)
-    return jnp.full((size, O), value), Memory(full, full + 0.5), jnp.full(size, value / 10), jnp.full(size, value)
+    return Start(
+        jnp.full((size, O), value), Memory(full, full + 0.5), jnp.full(size, value / 10), jnp.full(size, value)
+    )
 
 
-def test_an_empty_buffer_gives_weight_zero() -> None:
-    observation, memory, weight, depth = buffer().sample(8, key=jax.random.key(0))
+def test_an_empty_ring_gives_weight_zero() -> None:
+    observation, memory, weight, depth = ring().sample(8, key=jax.random.key(0))
     assert observation.shape == (8, O) and memory.cell.shape == (8, MEMORY) and depth.shape == (8,)
     assert not weight.any()
 
 
-def test_a_buffer_gives_only_what_was_added() -> None:
-    filled = buffer().add(*batch_of(1.0))
+def test_a_ring_gives_only_what_was_added() -> None:
+    filled = ring().add(batch_of(1.0))
     observation, memory, weight, depth = filled.sample(64, key=jax.random.key(0))
     assert (observation == 1).all() and (depth == 1).all() and (weight == jnp.float32(0.1)).all()
     assert (memory.hidden == 1).all() and (memory.cell == 1.5).all()
 
 
-def test_a_full_buffer_overwrites_its_oldest_states_first() -> None:
-    ring = buffer()
+def test_a_full_ring_overwrites_its_oldest_rows_first() -> None:
+    full = ring()
     for value in range(1, 6):  # five batches of two into six slots
-        ring = jax.jit(ImaginationBuffer.add)(ring, *batch_of(float(value)))
-        kept = {float(depth) for depth in ring.depth if depth}
+        full = jax.jit(Ring.add)(full, batch_of(float(value)))
+        kept = {float(depth) for depth in full.rows.depth if depth}
         assert kept == set(map(float, range(max(1, value - 2), value + 1)))
-    assert float(ring.added) == 10
-    np.testing.assert_array_equal(ring.observation[:, 0], ring.depth)
-    np.testing.assert_array_equal(ring.memory.cell[:, 0], ring.depth + 0.5)
+    assert int(full.added) == 10
+    np.testing.assert_array_equal(full.rows.observation[:, 0], full.rows.depth)
+    np.testing.assert_array_equal(full.rows.memory.cell[:, 0], full.rows.depth + 0.5)
 
 
-def test_sampling_a_buffer_is_uniform_over_what_it_holds() -> None:
-    ring = buffer(8)
+def test_sampling_a_ring_is_uniform_over_what_it_holds() -> None:
+    filled = ring(8)
     for value in range(1, 4):
-        ring = ring.add(*batch_of(float(value)))
+        filled = filled.add(batch_of(float(value)))
     draws = 6000
-    depth = np.asarray(ring.sample(draws, key=jax.random.key(1))[3])
+    depth = np.asarray(filled.sample(draws, key=jax.random.key(1)).depth)
     counts = np.bincount(depth.astype(int), minlength=4)
     assert counts[0] == 0
     np.testing.assert_allclose(counts[1:] / draws, 1 / 3, atol=0.03)
-    assert not np.array_equal(depth, ring.sample(draws, key=jax.random.key(2))[3])
+    assert not np.array_equal(depth, filled.sample(draws, key=jax.random.key(2)).depth)

@@ -82,11 +82,17 @@ def test_a_task_of_its_own_settings_keeps_all_others() -> None:
     assert agent_config("td3", "default", "LunarLanderContinuous-v3") == td3.Config()
 
 
-@pytest.mark.parametrize(("algorithm", "env"), [(name, env) for name, tasks in TASKS.items() for env in tasks])
-def test_a_task_s_settings_are_of_a_registered_task_and_differ_from_the_default(algorithm: str, env: str) -> None:
+@pytest.mark.parametrize(
+    ("preset", "algorithm", "env"),
+    [(preset, name, env) for preset, own in TASKS.items() for name, tasks in own.items() for env in tasks],
+)
+def test_a_task_s_settings_are_of_a_registered_task_and_differ_from_the_others(
+    preset: str, algorithm: str, env: str
+) -> None:
     assert env in gymnasium.registry
-    for name, value in TASKS[algorithm][env].items():
-        assert getattr(agent_config(algorithm, "default"), name) != value
+    for name, value in TASKS[preset][algorithm][env].items():
+        assert getattr(agent_config(algorithm, preset), name) != value
+        assert getattr(agent_config(algorithm, preset, env), name) == value
 
 
 def test_the_rivals_have_their_authors_sizes_and_settings() -> None:
@@ -102,8 +108,16 @@ def test_the_rivals_have_their_authors_sizes_and_settings() -> None:
             "random_steps": 25_000,
         }
     }
-    own |= {"sac": {"entropy_per_action": -1, "initial_temperature": 1, "random_steps": 1000}}
-    for algorithm in ("td3", "sac"):
+    soft = {"entropy_per_action": -1, "initial_temperature": 1}
+    own |= {"sac": soft | {"random_steps": 1000}}
+    # Janner et al. 2019, Appendix C, and as in their code.
+    own |= {
+        "mbpo": soft
+        | {"random_steps": 5000, "updates_per_step": 20, "rollouts_per_step": 400, "imagine_every": 250}
+        | {"retained_steps": 1000, "real_share": 0.05, "members": 7, "elites": 5, "model_width": 200}
+        | {"model_learning_rate": 1e-3, "fit_batch_size": 256, "rollout_length": 1, "final_rollout_length": 1}
+    }
+    for algorithm in ("td3", "sac", "mbpo"):
         config = agent_config(algorithm, "paper")
         expected = shared | own[algorithm]
         assert {name: getattr(config, name) for name in expected} == expected
@@ -115,7 +129,7 @@ def test_a_preset_names_nothing_that_the_config_does_not_have(algorithm: str) ->
 
 
 def test_unknown_names_are_refused_with_the_known_ones() -> None:
-    with pytest.raises(UserError, match="unknown --algorithm 'ppo'; expected one of mbdpg, td3, sac"):
+    with pytest.raises(UserError, match="unknown --algorithm 'ppo'; expected one of mbdpg, td3, sac, mbpo"):
         agent_config("ppo", "default")
     with pytest.raises(UserError, match="unknown --preset 'big'; expected default or paper"):
         agent_config("mbdpg", "big")

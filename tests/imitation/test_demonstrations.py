@@ -226,7 +226,6 @@ def test_training_from_demonstrations_clones_first_and_counts_their_cost(toy: An
 
     config = RunConfig(
         "Lottery-v0",
-        "mbdpg",
         mbdpg.Config(random_steps=20),
         Schedule(steps=40, cycle=10, evaluate_every=20, evaluation_episodes=1, log_every=20, checkpoint_every=20),
         demonstrations=str(file),

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 
-from mbdpg.agents import mbdpg, sac, td3
+from mbdpg.agents import mbdpg, mbpo, sac, td3
 from mbdpg.interfaces import Agent, Batch, EnvSpec, UserError
 from mbdpg.training.learner import Learner
 from mbdpg.training.replay import Replay
@@ -24,6 +24,11 @@ def make_td3(**settings: Any) -> Agent:
 
 def make_sac(**settings: Any) -> Agent:
     return sac.SAC(sac.Config(**(TINY | settings)), SPEC)
+
+
+def make_mbpo(**settings: Any) -> Agent:
+    small = {"members": 2, "elites": 1, "model_width": 4, "fit_batch_size": 3, "rollouts_per_step": 1}
+    return mbpo.MBPO(mbpo.Config(**(TINY | small | {"imagine_every": 4, "retained_steps": 8} | settings)), SPEC)
 
 
 def make_mbdpg(**settings: Any) -> Agent:
@@ -75,10 +80,10 @@ class Two(NamedTuple):
     metrics_alone: list[dict[str, np.ndarray]]
 
 
-@pytest.fixture(scope="module", params=["toy", "td3", "sac", pytest.param("mbdpg", marks=pytest.mark.slow)])
+@pytest.fixture(scope="module", params=["toy", "td3", "sac", "mbpo", pytest.param("mbdpg", marks=pytest.mark.slow)])
 def two(request: pytest.FixtureRequest, toy: Any) -> Two:
-    makers = {"toy": lambda: toy.ToyAgent(SPEC), "td3": make_td3, "sac": make_sac, "mbdpg": make_mbdpg}
-    make = makers[request.param]
+    makers = {"td3": make_td3, "sac": make_sac, "mbpo": make_mbpo, "mbdpg": make_mbdpg}
+    make = (makers | {"toy": lambda: toy.ToyAgent(SPEC)})[request.param]
     together, alone = Learner(make(), [4, 9]), Learner(make(), [9])
     return Two(together, alone, learn(together, [4, 9]), learn(alone, [9]))
 

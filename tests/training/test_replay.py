@@ -268,6 +268,25 @@ def test_demonstrations_alone_are_drawn_where_the_sampling_says_so() -> None:
     assert every.observation[..., 0, 0].max() > 4
 
 
+def test_kept_and_held_out_steps_are_apart_and_together_all() -> None:
+    replay = Replay(1, 1)
+    for row in range(23):
+        replay.add(np.float32([row]), np.float32([0]), float(row), np.float32([row + 1]), False, False)
+    drawn = {}
+    for part in ("all", "kept", "held-out"):
+        batch = replay.sample(40, Sampling(25, 0, 1, part=part), np.random.default_rng(0))
+        drawn[part] = set(batch.reward.ravel().astype(int).tolist())
+    assert drawn["held-out"] == {4, 9, 14, 19}
+    assert drawn["kept"] == drawn["all"] - drawn["held-out"] == set(range(23)) - {4, 9, 14, 19}
+
+
+def test_a_replay_too_small_to_hold_steps_out_gives_one_that_it_has() -> None:
+    replay = Replay(1, 1)
+    replay.add(np.float32([0]), np.float32([0]), 7.0, np.float32([1]), False, False)
+    batch = replay.sample(1, Sampling(3, 0, 1, part="held-out"), np.random.default_rng(0))
+    assert (batch.reward == 7).all()
+
+
 def test_extending_puts_episodes_behind_and_closes_an_open_one_before() -> None:
     replay, other = filled(), filled()
     replay.extend(other.columns())

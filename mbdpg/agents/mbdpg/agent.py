@@ -15,7 +15,7 @@ from mbdpg.agents.mbdpg import instruments
 from mbdpg.agents.mbdpg.config import Config
 from mbdpg.agents.mbdpg.state import State, initial_state, optimizers
 from mbdpg.dynamics.fitting import Window, dynamics_loss, warm_memory
-from mbdpg.dynamics.imagination import ImaginationBuffer, Start, Trajectory, imagine
+from mbdpg.dynamics.imagination import Ring, Start, Trajectory, imagine
 from mbdpg.dynamics.mixture import Scales
 from mbdpg.interfaces import Batch, EnvSpec, Metrics, Phase, Sampling, Statistics
 from mbdpg.networks.critic import Critics
@@ -271,12 +271,12 @@ class MBDPG:
         )
         return real, expanded
 
-    def _store(self, buffer: ImaginationBuffer, start: Start, imagined: Trajectory) -> ImaginationBuffer:
+    def _store(self, ring: Ring, start: Start, imagined: Trajectory) -> Ring:
         """Keep where imagination ended, with weight 0 (nothing starts there) if it went too deep."""
         depth = start.depth + self.config.horizon
         shallow = depth <= self.config.imagination_depth
         weight = jnp.where(shallow, imagined.survival()[-1] * start.weight, 0.0)
-        return buffer.add(imagined.observations[-1], imagined.memory, weight, depth)
+        return ring.add(Start(imagined.observations[-1], imagined.memory, weight, depth))
 
     @property
     def diagnosis(self) -> Sampling:

@@ -11,7 +11,7 @@ import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from mbdpg.agents.mbdpg.config import Config
-from mbdpg.dynamics.imagination import ImaginationBuffer
+from mbdpg.dynamics.imagination import Ring, Start
 from mbdpg.dynamics.mixture import MixtureDynamics, Scales
 from mbdpg.interfaces import EnvSpec
 from mbdpg.networks.critic import Critics
@@ -38,7 +38,8 @@ class State(eqx.Module):
     scales: Scales
     return_scale: Float[Array, ""]
     """Reward that counts as one unit of value."""
-    imagined: ImaginationBuffer
+    imagined: Ring
+    """Of `Start`s: where imagination ended and may go on."""
     beta: Float[Array, ""]
     std: Float[Array, ""]
     """Of the behavior policy."""
@@ -78,7 +79,7 @@ def initial_state(config: Config, env: EnvSpec, optimizers: Optimizers, *, key: 
     dynamics = MixtureDynamics(o, a, gaussians=config.gaussians, memory=config.memory, widths=widths, key=dynamics_key)
     actor = Policy(o, a, widths, key=actor_key)
     critics = Critics(o, a, widths, key=critic_key)
-    one, slots = jnp.ones(()), 8 * config.batch_size
+    one, zero, slots = jnp.ones(()), jnp.zeros(()), 8 * config.batch_size
     return State(
         dynamics=dynamics,
         average_dynamics=jax.tree.map(jnp.copy, dynamics),
@@ -93,7 +94,7 @@ def initial_state(config: Config, env: EnvSpec, optimizers: Optimizers, *, key: 
         normalizer=identity(o),
         scales=Scales(jnp.ones(o), one, one),
         return_scale=one,
-        imagined=ImaginationBuffer.empty(slots, o, dynamics.initial_memory((slots,))),
+        imagined=Ring.empty(slots, Start(jnp.zeros(o), dynamics.initial_memory(()), zero, zero)),
         beta=jnp.asarray(config.beta, jnp.float32),
         std=jnp.asarray(config.exploration_std, jnp.float32),
         fits=jnp.zeros((), jnp.int32),

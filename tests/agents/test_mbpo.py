@@ -1,0 +1,224 @@
+"""MBPO: what each of its phases moves, what it imagines, and what SAC is given of it."""
+
+import functools
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mbdpg.agents.mbpo import MBPO, Config, State
+from mbdpg.dynamics.ensemble import predict
+from mbdpg.interfaces import Batch, EnvSpec, Statistics, UserError
+
+O, A, BATCH = 3, 2, 8
+ENV = EnvSpec("made-in-code", observation_size=O, action_size=A, episode_limit=None, reference_return=None)
+SMALL: dict[str, Any] = {
+    **{"width": 8, "batch_size": BATCH, "real_share": 0.25, "members": 3, "elites": 2, "model_width": 8},
+    **{"fit_batch_size": 4, "rollouts_per_step": 2, "imagine_every": 5, "retained_steps": 20},
+}
+
+
+def agent(env: EnvSpec = ENV, **settings: Any) -> MBPO:
+    return MBPO(Config(**(SMALL | settings)), env)
+
+
+def statistics(steps: float = 100.0) -> Statistics:
+    numbers = ([0.1, -0.2, 0.3], [1.0, 2.0, 0.5], [0.2, 1.0, 0.25], 0.8, 5.0, 2.0, 0.0, steps)
+    return Statistics(*(jnp.asarray(x, jnp.float32) for x in numbers))
+
+
+@functools.cache
+def state() -> State:
+    """Networks away from their start, half of all steps end; the second member has the least error, the first most."""
+    rng = np.random.default_rng(0)
+    fresh = agent().init(key=jax.random.key(0))
+
+    def networks(x: State) -> Any:
+        return x.ensemble, x.soft.actor, x.soft.critics
+
+    moved = jax.tree.map(lambda x: x + jnp.asarray(rng.normal(0, 0.2, x.shape), jnp.float32), networks(fresh))
+    moved = eqx.tree_at(networks, fresh, moved)
+    moved = eqx.tree_at(lambda x: x.ensemble.members.output.bias, moved, replace_fn=lambda x: x.at[:, -1].set(0.0))
+    return agent().prepare(eqx.tree_at(lambda x: x.errors, moved, jnp.asarray([3.0, 1.0, 2.0])), statistics())
+
+
+def batch(size: int, seed: int = 1) -> Batch:
+    rng = np.random.default_rng(seed)
+
+    def draw(*shape: int) -> jax.Array:
+        return jnp.asarray(rng.normal(size=(size, 1, *shape)), jnp.float32)
+
+    ends = jnp.asarray(rng.uniform(size=(size, 1)) < 0.3, jnp.float32)
+    return Batch(draw(O), jnp.tanh(draw(A)), draw(), draw(O), ends, jnp.ones((size, 1)))
+
+
+def take(name: str, before: State, one: MBPO | None = None, seed: int = 1) -> tuple[State, dict[str, Any]]:
+    """One update of a phase."""
+    one = one or agent()
+    phase = next(phase for phase in one.phases if phase.name == name)
+    return jax.jit(phase.update)(before, batch(phase.sampling.batch_size, seed), key=jax.random.key(seed))
+
+
+def moved(before: Any, after: Any) -> set[str]:
+    def same(a: jax.Array, b: jax.Array) -> bool:
+        return np.asarray(a).tobytes() == np.asarray(b).tobytes()
+
+    return {
+        name
+        for name in vars(before)
+        if not all(jax.tree.leaves(jax.tree.map(same, getattr(before, name), getattr(after, name))))
+    }
+
+
+def test_phases_come_in_the_order_in_which_each_needs_the_one_before() -> None:
+    assert [phase.name for phase in agent().phases] == ["fitting", "validating", "imagining", "improving"]
+    assert all(phase.after_steps == agent().config.random_steps for phase in agent().phases)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("fitting", {"ensemble", "ensemble_optimizer"}),
+        ("validating", {"errors"}),
+        ("imagining", {"imagined"}),
+        ("improving", {"soft"}),
+    ],
+)
+def test_a_phase_moves_its_own_part_alone(name: str, expected: set[str]) -> None:
+    assert moved(state(), take(name, state())[0]) == expected
+
+
+def test_fitting_moves_every_parameter_of_every_member() -> None:
+    after, _ = take("fitting", state())
+    for old, new in zip(jax.tree.leaves(state().ensemble), jax.tree.leaves(after.ensemble), strict=True):
+        assert all((old[i] != new[i]).any() for i in range(3))
+
+
+def test_learning_steps_are_never_the_ones_that_judge() -> None:
+    parts = {phase.name: phase.sampling.part for phase in agent().phases}
+    assert parts == {"fitting": "kept", "validating": "held-out", "imagining": "all", "improving": "all"}
+
+
+def test_errors_are_a_running_average_and_begin_with_the_first() -> None:
+    zero = eqx.tree_at(lambda x: x.errors, state(), jnp.zeros(3))
+    first = take("validating", zero)[0].errors
+    assert (first > 0).all()
+    second = take("validating", take("validating", zero)[0], seed=2)[0].errors
+    np.testing.assert_allclose(second, 0.5 * (first + take("validating", zero, seed=2)[0].errors), rtol=1e-5)
+
+
+def imagined(length: int, env: EnvSpec = ENV, **settings: Any) -> tuple[Any, jax.Array]:
+    """What `length` steps of imagination add, step by step, and where it began."""
+    one, size = agent(env, **settings), 10
+    before = eqx.tree_at(lambda x: x.rollout_length, state(), jnp.int32(length))
+    after, _ = take("imagining", before, one)
+    assert int(after.imagined.added) == length * size
+    rows = jax.tree.map(lambda x: x[: length * size].reshape(length, size, *x.shape[1:]), after.imagined.rows)
+    return rows, batch(size).observation[:, 0]
+
+
+def test_a_rollout_goes_on_where_it_was_and_begins_again_where_it_ended() -> None:
+    rows, start = imagined(4)
+    np.testing.assert_array_equal(rows.observation[0], start)
+    ends = rows.terminated == 1
+    assert 0 < ends.sum() < ends.size and set(np.unique(rows.terminated)) == {0.0, 1.0}
+    for t in range(3):
+        following = jnp.where(ends[t][:, None], start, rows.next_observation[t])
+        np.testing.assert_array_equal(rows.observation[t + 1], following)
+
+
+def test_a_rollout_is_the_actor_s_in_an_elite() -> None:
+    rows, start = imagined(1)
+    assert (jnp.abs(rows.action) < 1).all()
+    mean, _ = state().soft.actor.sample(state().soft.normalizer(start), key=jax.random.key(5))
+    assert not np.allclose(rows.action[0], mean)  # drawn, with a key of its own
+    everywhere = predict(
+        state().ensemble,
+        state().units,
+        jnp.broadcast_to(start, (3, 10, O)),
+        jnp.broadcast_to(rows.action[0], (3, 10, A)),
+    )
+    # Narrow Gaussians tell which member it was.
+    narrow = eqx.tree_at(lambda x: x.ensemble.members.max_log_variance, state(), jnp.full((3, O + 1), -20.0))
+    narrow = eqx.tree_at(lambda x: x.ensemble.members.min_log_variance, narrow, jnp.full((3, O + 1), -20.0))
+    after = take("imagining", narrow)[0].imagined.rows.next_observation[:10]
+    distances = np.max(np.abs(np.asarray(everywhere.next_observation) - np.asarray(after)), axis=-1)
+    used = np.argmin(distances, axis=0)
+    assert (np.min(distances, axis=0) < 1e-3).all()
+    assert set(used[:5]) | set(used[5:]) == {1, 2} and len(set(used[:5])) == len(set(used[5:])) == 1
+
+
+def test_an_end_is_paid_by_its_own_head() -> None:
+    rows, _ = imagined(1)
+    everywhere = predict(
+        state().ensemble,
+        state().units,
+        jnp.broadcast_to(rows.observation[0], (3, 10, O)),
+        jnp.broadcast_to(rows.action[0], (3, 10, A)),
+    )
+    ended = np.flatnonzero(rows.terminated[0])
+    off = np.min(np.abs(np.asarray(everywhere.terminal_reward) - np.asarray(rows.reward[0])), axis=0)
+    assert len(ended) and (off[ended] < 1e-4).all()
+    assert (np.delete(off, ended) > 1e-4).all()
+
+
+def test_a_known_rule_takes_the_place_of_the_learned_one() -> None:
+    rows, _ = imagined(2, ENV.__class__("Ant-v5", O, A, None, None), termination="known")
+    height = rows.next_observation[..., 0]
+    np.testing.assert_array_equal(rows.terminated == 0, (height >= 0.2) & (height <= 1.0))
+    with pytest.raises(UserError, match="nobody told us the rule of made-in-code"):
+        agent(termination="known")
+
+
+@pytest.mark.parametrize(("steps", "expected"), [(0, 1), (200, 1), (300, 3), (400, 5), (9000, 5)])
+def test_rollouts_grow_between_two_steps(steps: int, expected: int) -> None:
+    one = agent(lengthen_from=200, lengthen_until=400, final_rollout_length=5)
+    assert int(one.prepare(state(), statistics(steps)).rollout_length) == expected
+
+
+def test_the_ring_keeps_the_last_steps() -> None:
+    one, current = agent(), state()
+    for seed in range(5):
+        current, _ = take("imagining", current, one, seed=seed)
+    assert current.imagined.rows.reward.shape == (40,)  # 20 steps of 2 rollouts
+    kept = set(np.asarray(current.imagined.rows.observation)[:, 0].tolist())
+    assert kept == {float(x) for seed in range(1, 5) for x in batch(10, seed).observation[:, 0, 0]}
+
+
+@pytest.mark.parametrize(("share", "real"), [(0.25, 2), (0.0, 0), (1.0, 8)])
+def test_sac_is_given_a_share_of_real_transitions(share: float, real: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    one, given = agent(real_share=share), []
+    filled, _ = take("imagining", state(), one)
+    update = one._sac.update
+
+    def spy(soft: Any, mixed: Batch, *, key: jax.Array) -> Any:
+        given.append(mixed)
+        return update(soft, mixed, key=key)
+
+    monkeypatch.setattr(one._sac, "update", spy)
+    true = batch(max(real, 1), seed=9)
+    with jax.disable_jit():
+        one.improve(filled, true, key=jax.random.key(0))
+    assert given[0].reward.shape == (BATCH, 1) and (given[0].valid == 1).all()
+    np.testing.assert_array_equal(given[0].reward[:real], true.reward[:real])
+    known = set(np.asarray(filled.imagined.rows.reward).tolist())
+    assert all(float(x) in known for x in given[0].reward[real:, 0])
+
+
+def test_a_batch_that_is_not_finite_moves_no_member_and_is_counted() -> None:
+    phase = agent().phases[0]
+    bad = batch(phase.sampling.batch_size)
+    bad = bad._replace(reward=bad.reward.at[0].set(jnp.inf))
+    after, metrics = jax.jit(phase.update)(state(), bad, key=jax.random.key(0))
+    assert "ensemble" not in moved(state(), after) and metrics["dynamics/skipped"] == 1
+
+
+def test_instruments_are_sacs_and_the_ensembles() -> None:
+    sampling = agent().diagnosis
+    windows = jax.tree.map(lambda x: jnp.broadcast_to(x, (BATCH, sampling.length, *x.shape[2:])), batch(BATCH))
+    metrics = jax.jit(agent().diagnose)(state(), windows, jnp.zeros(BATCH))
+    assert {"critic/q_bias", "dynamics/rmse_k01", "dynamics/persistence_k20"} <= metrics.keys()
+    assert all(np.isfinite(value) for value in metrics.values())
