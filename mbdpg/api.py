@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mbdpg import envs
+from mbdpg.dynamics.planning import PlanningPolicy
 from mbdpg.experiments import run
 from mbdpg.experiments.config import AgentConfig, RunConfig
 from mbdpg.experiments.presets import agent_config
@@ -81,8 +82,10 @@ def resume(
     run.resume(Path(path), make_env=_maker(env), steps=steps, watch=lambda config, env_steps: on_update)
 
 
-def load_policy(path: str | Path, *, best: bool = False) -> NumpyPolicy:
-    """The policy of a run: a function from one raw observation to one action in [-1, 1], in NumPy alone.
+def load_policy(path: str | Path, *, best: bool = False) -> NumpyPolicy | PlanningPolicy:
+    """The policy of a run: a function from one raw observation to one action in [-1, 1].
+
+    In NumPy alone, but for PETS, which plans with JAX and whose `reset()` is to be called when an episode begins.
 
     Args:
         path: the run folder.

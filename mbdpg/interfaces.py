@@ -113,6 +113,23 @@ class Environment(Protocol):
     def close(self) -> None: ...
 
 
+@runtime_checkable
+class Acting(Protocol):
+    """A policy on the host, for one environment."""
+
+    arrays: dict[str, np.ndarray]
+    """What it is made of, by name: the content of a policy file."""
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """The action, in [-1, 1], for a raw observation."""
+
+    def explore(self, observation: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """An action to learn from, given noise of the action's shape."""
+
+    def reset(self) -> None:
+        """A new episode begins."""
+
+
 class Batch(NamedTuple):
     """Windows of consecutive environment steps in raw units, float32; `valid` marks steps inside the episode."""
 

@@ -230,7 +230,10 @@ def test_an_unknown_verb_is_answered_with_the_known_ones(say: Any) -> None:
         (("Pendulum-v1", "--discount", "1.5"), "--discount is 1.5, expected a number from 0 to 1"),
         (("Pendulum-v1", "--actor-learning-rate", "nan"), "--actor-learning-rate is nan"),
         (("Pendulum-v1", "--preset", "big"), "unknown --preset 'big'"),
-        (("Pendulum-v1", "--algorithm", "ppo"), "unknown --algorithm 'ppo'; expected one of mbdpg, td3, sac, mbpo"),
+        (
+            ("Pendulum-v1", "--algorithm", "ppo"),
+            "unknown --algorithm 'ppo'; expected one of mbdpg, td3, sac, pets, mbpo",
+        ),
         (("Pendulum-v1", "--seeds", "1", "1"), "--seeds are [1, 1], expected one number or more, all different"),
         (("Pendulum-v1", "--seeds", "-1"), "--seeds are [-1], expected numbers from 0"),
         (("Pendulum-v1", "--max-episode-steps", "0"), "--max-episode-steps is 0"),

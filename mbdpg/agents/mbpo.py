@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from mbdpg.agents import sac
-from mbdpg.dynamics.ensemble import Ensemble, Units, ensemble_loss, held_out_error, open_loop_error, predict
+from mbdpg.dynamics.ensemble import DEPTHS, Units, open_loop_error, predict
 from mbdpg.dynamics.imagination import Ring
-from mbdpg.dynamics.termination import known_rule
+from mbdpg.dynamics.termination import RULES, known_rule
+from mbdpg.dynamics.world import Fitting, World
 from mbdpg.interfaces import Batch, EnvSpec, Metrics, Phase, Sampling, Statistics, require, require_settings
 from mbdpg.networks.normalizer import Normalizer
 from mbdpg.networks.policy import GaussianPolicy, Policy
-
-DEPTHS = (1, 5, 10, 20)
-"""Imagined steps after which the instruments look."""
 
 
 @dataclass(frozen=True)
@@ -100,11 +97,7 @@ class State(eqx.Module):
 
     soft: sac.State
     """SAC's."""
-    ensemble: Ensemble
-    ensemble_optimizer: Any
-    units: Units
-    errors: Float[Array, " member"]
-    """Each member's held-out error, a running average."""
+    world: World
     imagined: Ring
     """Of `Transition`s."""
     rollout_length: Int[Array, ""]
@@ -122,18 +115,17 @@ class MBPO:
         c = self.config = config
         self.env = env
         self._sac = sac.SAC(sac.Config(**{f.name: getattr(c, f.name) for f in fields(sac.Config)}), env)
-        self._rule = known_rule(env) if c.termination == "known" else None
-        self._optimizer = optax.apply_if_finite(optax.adam(c.model_learning_rate), max_consecutive_errors=10**9)
+        self._rule = RULES[known_rule(env)] if c.termination == "known" else None
+        self._fitting = Fitting(c.members, c.model_width, c.model_learning_rate, c.weight_decay, c.fit_batch_size)
         self._real = min(round(c.real_share * c.batch_size), c.batch_size)
         # As many for every elite.
         self._rollouts = c.elites * max(1, round(c.rollouts_per_step * c.imagine_every / c.elites))
-        kept = Sampling(c.members * c.fit_batch_size, burn_in=0, length=1, part="kept")
-        held_out = Sampling(1024, burn_in=0, length=1, part="held-out")
+        steps, judging = self._fitting.sampling, self._fitting.judging
         starts, real = (Sampling(size, burn_in=0, length=1) for size in (self._rollouts, max(self._real, 1)))
         now, every = c.random_steps, 1.0 / c.imagine_every
         self.phases = (
-            Phase("fitting", c.fits_per_step, now, sampling=kept, first_updates=c.first_fits, update=self.fit),
-            Phase("validating", every, now, sampling=held_out, first_updates=1, update=self.validate),
+            Phase("fitting", c.fits_per_step, now, sampling=steps, first_updates=c.first_fits, update=self.fit),
+            Phase("judging", every, now, sampling=judging, first_updates=1, update=self.judge),
             Phase("imagining", every, now, sampling=starts, first_updates=1, update=self.imagine),
             Phase("improving", c.updates_per_step, now, sampling=real, update=self.improve),
         )
@@ -141,16 +133,12 @@ class MBPO:
     def init(self, *, key: PRNGKeyArray) -> State:
         """Fresh networks and nothing imagined."""
         c, o, a = self.config, self.env.observation_size, self.env.action_size
-        soft_key, ensemble_key = jax.random.split(key)
-        ensemble = Ensemble(o, a, count=c.members, widths=(c.model_width,) * 4, key=ensemble_key)
+        soft_key, world_key = jax.random.split(key)
         nothing = jnp.zeros(())
         slots = self._rollouts * max(1, c.retained_steps // c.imagine_every)
         return State(
             soft=self._sac.init(key=soft_key),
-            ensemble=ensemble,
-            ensemble_optimizer=self._optimizer.init(ensemble),
-            units=Units.raw(o),
-            errors=jnp.zeros(c.members),
+            world=self._fitting.init(self.env, key=world_key),
             imagined=Ring.empty(slots, Transition(jnp.zeros(o), jnp.zeros(a), nothing, jnp.zeros(o), nothing)),
             rollout_length=jnp.asarray(c.rollout_length, jnp.int32),
         )
@@ -161,7 +149,7 @@ class MBPO:
         way = jnp.clip((statistics.steps - c.lengthen_from) / (c.lengthen_until - c.lengthen_from), 0.0, 1.0)
         length = c.rollout_length + way * (c.final_rollout_length - c.rollout_length)
         return eqx.tree_at(
-            lambda x: (x.soft, x.units, x.rollout_length),
+            lambda x: (x.soft, x.world.units, x.rollout_length),
             state,
             (self._sac.prepare(state.soft, statistics), Units.of(statistics), length.astype(jnp.int32)),
         )
@@ -175,38 +163,30 @@ class MBPO:
         return self._sac.behavior(state.soft)
 
     def fit(self, state: State, batch: Batch, *, key: PRNGKeyArray) -> tuple[State, Metrics]:
-        """One update of all members, each from steps of its own."""
+        """One update of the ensemble."""
         del key
-        shape = (self.config.members, self.config.fit_batch_size)
-        batch = jax.tree.map(lambda x: x.reshape(*shape, *x.shape[2:]), batch)
-        (_, metrics), gradient = jax.value_and_grad(ensemble_loss, has_aux=True)(
-            state.ensemble, state.units, batch, weight_decay=self.config.weight_decay
-        )
-        updates, optimizer_state = self._optimizer.update(gradient, state.ensemble_optimizer)
-        ensemble = optax.apply_updates(state.ensemble, updates)
-        state = eqx.tree_at(lambda x: (x.ensemble, x.ensemble_optimizer), state, (ensemble, optimizer_state))
-        return state, metrics | {"dynamics/skipped": optimizer_state.total_notfinite}
+        world, metrics = self._fitting.fit(state.world, batch)
+        return eqx.tree_at(lambda x: x.world, state, world), metrics
 
-    def validate(self, state: State, batch: Batch, *, key: PRNGKeyArray) -> tuple[State, Metrics]:
-        """Measure every member on steps that none learns from."""
+    def judge(self, state: State, batch: Batch, *, key: PRNGKeyArray) -> tuple[State, Metrics]:
+        """Find out which members are the elites."""
         del key
-        now = held_out_error(state.ensemble, state.units, jax.tree.map(lambda x: x[:, 0], batch))
-        errors = jnp.where(state.errors > 0.0, 0.5 * (state.errors + now), now)
-        return eqx.tree_at(lambda x: x.errors, state, errors), {"dynamics/held_out_mse": jnp.mean(now)}
+        world, metrics = self._fitting.judge(state.world, batch)
+        return eqx.tree_at(lambda x: x.world, state, world), metrics
 
     def imagine(self, state: State, batch: Batch, *, key: PRNGKeyArray) -> tuple[State, Metrics]:
         """Roll the actor out in the elites from real states; a rollout that ends begins again where it began."""
         start = batch.observation[:, 0]
-        elites = jnp.argsort(state.errors)[: self.config.elites]
+        elites = state.world.elites(self.config.elites)
 
         def step(t: Array, carry: tuple[Array, Ring]) -> tuple[Array, Ring]:
             observation, ring = carry
             action_key, elite_key, model_key, end_key = jax.random.split(jax.random.fold_in(key, t), 4)
             action, _ = state.soft.actor.sample(state.soft.normalizer(observation), key=action_key)
             # The rows are in no order, so that blocks of them for each elite are as good as an elite for each row.
-            ensemble = state.ensemble.chosen(jax.random.permutation(elite_key, elites))
+            ensemble = state.world.ensemble.chosen(jax.random.permutation(elite_key, elites))
             blocks = (x.reshape(self.config.elites, -1, x.shape[-1]) for x in (observation, action))
-            imagined = predict(ensemble, state.units, *blocks, key=model_key)
+            imagined = predict(ensemble, state.world.units, *blocks, key=model_key)
             after, reward, terminal_reward, continues = (x.reshape(start.shape[0], *x.shape[2:]) for x in imagined)
             ends = ~self._rule(after) if self._rule else jax.random.uniform(end_key, continues.shape) > continues
             reward = jnp.where(ends, terminal_reward, reward)
@@ -233,5 +213,5 @@ class MBPO:
 
     def diagnose(self, state: State, batch: Batch, realized_return: Array) -> Metrics:
         """SAC's instruments, and the ensemble's open-loop error."""
-        errors = open_loop_error(state.ensemble, state.units, batch, depths=DEPTHS)
+        errors = open_loop_error(state.world.ensemble, state.world.units, batch)
         return self._sac.diagnose(state.soft, batch, realized_return) | errors

@@ -40,7 +40,7 @@ RunArgument = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")
 class RunOptions:
     """What is run."""
 
-    algorithm: Literal["mbdpg", "td3", "sac", "mbpo"] = "mbdpg"
+    algorithm: Literal["mbdpg", "td3", "sac", "pets", "mbpo"] = "mbdpg"
     """Algorithm to train."""
     preset: presets.Preset = "default"
     """Settings that measured best, or those published; other flags change single ones."""

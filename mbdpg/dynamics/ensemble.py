@@ -17,6 +17,9 @@ from mbdpg.interfaces import Batch, Metrics, Statistics
 from mbdpg.networks.mlp import Linear
 from mbdpg.networks.normalizer import Normalizer, identity
 
+DEPTHS = (1, 5, 10, 20)
+"""Steps after which the open-loop error is looked at."""
+
 BOUNDS_WEIGHT = 0.01
 """Of the term that draws the learned bounds of the log variance together (Chua et al. 2018, Appendix A.1)."""
 
@@ -197,7 +200,7 @@ def predict(
     )
 
 
-def open_loop_error(ensemble: Ensemble, units: Units, batch: Batch, *, depths: tuple[int, ...]) -> Metrics:
+def open_loop_error(ensemble: Ensemble, units: Units, batch: Batch, *, depths: tuple[int, ...] = DEPTHS) -> Metrics:
     """Root mean square error of the members' open-loop predictions, averaged, beside that of persistence.
 
     Args:

@@ -9,16 +9,17 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from mbdpg import envs
-from mbdpg.agents import mbdpg, mbpo, sac, td3
+from mbdpg.agents import mbdpg, mbpo, pets, sac, td3
 from mbdpg.interfaces import require
 from mbdpg.training.loop import Schedule
 
-AgentConfig = mbdpg.Config | td3.Config | sac.Config | mbpo.Config
+AgentConfig = mbdpg.Config | td3.Config | sac.Config | pets.Config | mbpo.Config
 
 CONFIGS: dict[str, type[AgentConfig]] = {
     "mbdpg": mbdpg.Config,
     "td3": td3.Config,
     "sac": sac.Config,
+    "pets": pets.Config,
     "mbpo": mbpo.Config,
 }
 """By the name of the algorithm that they are settings of."""

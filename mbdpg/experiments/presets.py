@@ -44,6 +44,16 @@ PAPER: dict[str, dict[str, Any]] = {
     # The authors' own code: sfujim/TD3 and rail-berkeley/softlearning.
     "td3": {"layers": 2, "plain": True, "random_steps": 25_000},
     "sac": {"layers": 2, "plain": True, "random_steps": 1000},
+    # kchua/handful-of-trials, for HalfCheetah.
+    "pets": {
+        "horizon": 30,
+        "particles": 4,
+        "population": 500,
+        "plan_elites": 50,
+        "iterations": 5,
+        "model_width": 200,
+        "random_steps": 1000,
+    },
     # jannerm/mbpo.
     "mbpo": {"layers": 2, "plain": True, "random_steps": 5000, "updates_per_step": 20.0, "fits_per_step": 2.0},
 }

@@ -10,7 +10,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from mbdpg.agents import mbdpg, mbpo, sac, td3
+from mbdpg.agents import mbdpg, mbpo, pets, sac, td3
+from mbdpg.dynamics.planning import PlanningPolicy, is_planner, planner_of
 from mbdpg.experiments.config import RunConfig
 from mbdpg.experiments.recorder import Recorder
 from mbdpg.imitation.demonstrations import Demonstrations
@@ -131,7 +132,7 @@ def resume(
         training.run(watch(config, training.env_steps), should_stop)
 
 
-def load_policy(path: Path, *, best: bool = False, spec: EnvSpec | None = None) -> NumpyPolicy:
+def load_policy(path: Path, *, best: bool = False, spec: EnvSpec | None = None) -> NumpyPolicy | PlanningPolicy:
     """The policy of a run folder: its latest, or the one with the best evaluation.
 
     Raises:
@@ -141,7 +142,8 @@ def load_policy(path: Path, *, best: bool = False, spec: EnvSpec | None = None) 
     if not name.is_file():
         raise UserError(f"{path} has no {name.name} yet; expected a run folder that has evaluated at least once")
     try:
-        policy = NumpyPolicy(read_array_file(name, "policy")[0])
+        arrays = read_array_file(name, "policy")[0]
+        policy = PlanningPolicy(planner_of(arrays)) if is_planner(arrays) else NumpyPolicy(arrays)
     except ValueError as error:
         raise UserError(f"{name} is not a policy: {error}") from error
     if spec is not None:
@@ -170,6 +172,8 @@ def make_agent(config: RunConfig, spec: EnvSpec) -> Agent:
             return mbpo.MBPO(config.agent, spec)
         case sac.Config():
             return sac.SAC(config.agent, spec)
+        case pets.Config():
+            return pets.PETS(config.agent, spec)
 
 
 def _compose(

@@ -115,6 +115,9 @@ class NumpyPolicy:
         std = np.exp(np.clip(features @ spread_weight + spread_bias, LOG_STD_MIN, LOG_STD_MAX))
         return np.tanh(features @ weight + bias + std * noise).astype(np.float32)
 
+    def reset(self) -> None:
+        """Nothing: one episode leaves no trace in the next."""
+
     def _features(self, observation: np.ndarray) -> np.ndarray:
         x = np.asarray(observation, np.float32)
         if x.shape != self._mean.shape:

@@ -11,12 +11,10 @@ from typing import Any
 import numpy as np
 
 from mbdpg.envs import episode_seed
-from mbdpg.interfaces import Environment, UserError
+from mbdpg.interfaces import Acting, Environment, UserError
 from mbdpg.training.faults import EnvironmentFailedError, guarded
 from mbdpg.training.randomness import NOISE_BLOCK, noise_block, random_stream
 from mbdpg.training.replay import Replay
-
-Explore = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 RECENT = 10
 """Training episodes whose mean return counts as the policy's."""
@@ -69,11 +67,11 @@ class Collector:
         self._return = 0.0
         self._observation: np.ndarray | None = None
 
-    def collect(self, explore: Explore, std: float, steps: int) -> None:
+    def collect(self, policy: Acting, std: float, steps: int) -> None:
         """Record `steps` environment steps, with uniformly random actions during the first `random_steps`.
 
         Args:
-            explore: action from an observation and noise (see `NumpyPolicy.explore`).
+            policy: explores.
             std: standard deviation of the noise, its mean over episodes.
             steps: environment steps to take.
         """
@@ -82,7 +80,8 @@ class Collector:
             try:
                 if self._observation is None:
                     self._observation = self._reset()
-                self._step(self._action(explore, std))
+                    policy.reset()
+                self._step(self._action(policy, std))
             except EnvironmentFailedError as error:
                 self._recover(error)
         if self.baseline is None and self.env_steps >= self._random_steps and self.returns:
@@ -150,14 +149,14 @@ class Collector:
         """Close the environment."""
         self._env.close()
 
-    def _action(self, explore: Explore, std: float) -> np.ndarray:
+    def _action(self, policy: Acting, std: float) -> np.ndarray:
         size = self._env.spec.action_size
         if self.env_steps < self._random_steps:
             return random_stream(self.seed, "uniform", self.env_steps).uniform(-1.0, 1.0, size).astype(np.float32)
         assert self._observation is not None
         block, row = divmod(self.env_steps, NOISE_BLOCK)
         std *= 1.0 + self._scatter * random_stream(self.seed, "scatter", self.episode).uniform(-1.0, 1.0)
-        return explore(self._observation, std * noise_block(self.seed, block, size, self._color)[row])
+        return policy.explore(self._observation, std * noise_block(self.seed, block, size, self._color)[row])
 
     def _step(self, action: np.ndarray) -> None:
         assert self._observation is not None

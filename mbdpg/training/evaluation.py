@@ -10,12 +10,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mbdpg.interfaces import Batch, Environment, Sampling
+from mbdpg.interfaces import Acting, Batch, Environment, Sampling
 from mbdpg.training.faults import EnvironmentFailedError, guarded
 from mbdpg.training.replay import Replay
 
 UNSEEN = 0.05
 """A step's discounted return counts as known if at most this share of its weight lies beyond a time limit."""
+
+
+class StoppedError(Exception):
+    """Asked to stop in the middle of an evaluation; a resumed run begins it again."""
 
 
 class Evaluation(NamedTuple):
@@ -36,6 +40,7 @@ def evaluate(
     policy: Callable[[np.ndarray], np.ndarray],
     seeds: Sequence[int],
     on_frame: Callable[[np.ndarray], None] | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
 ) -> Evaluation:
     """Run one episode per environment seed, without noise.
 
@@ -46,15 +51,17 @@ def evaluate(
         policy: actions in [-1, 1] from raw observations.
         seeds: of the resets.
         on_frame: called with an RGB image before every step, if given.
+        should_stop: asked before every step: an episode of somebody's environment may take minutes, or never end.
 
     Raises:
+        StoppedError: `should_stop` said yes.
         UserError: the environment does not keep what its spaces promise.
     """
     steps = Replay(env.spec.observation_size, env.spec.action_size)
     returns, lengths, faults = [], [], 0
     for seed in seeds:
         try:
-            total, length = _episode(env, policy, seed, steps, on_frame)
+            total, length = _episode(env, policy, seed, steps, on_frame, should_stop)
         except EnvironmentFailedError as fault:
             faults += 1
             steps.close_episode()
@@ -71,10 +78,15 @@ def _episode(
     seed: int,
     steps: Replay,
     on_frame: Callable[[np.ndarray], None] | None,
+    should_stop: Callable[[], bool],
 ) -> tuple[float, int]:
     """Append one episode to `steps`; return its return and length."""
     observation, total, length, over = guarded(partial(env.reset, seed=seed)), 0.0, 0, False
+    if isinstance(policy, Acting):
+        policy.reset()
     while not over:
+        if should_stop():
+            raise StoppedError
         if on_frame is not None:
             on_frame(env.render())
         action = np.asarray(policy(observation), np.float32)

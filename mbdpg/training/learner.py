@@ -10,7 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mbdpg.interfaces import Agent, Batch, Metrics, Phase, Statistics, UserError
+from mbdpg.dynamics.planning import Planner, PlanningPolicy
+from mbdpg.interfaces import Acting, Agent, Batch, Metrics, Phase, Statistics, UserError
+from mbdpg.networks.leaves import leaf_name
 from mbdpg.networks.normalizer import Normalizer
 from mbdpg.networks.policy import GaussianPolicy, NumpyPolicy, Policy, policy_arrays
 
@@ -55,23 +57,26 @@ class Learner:
         metrics = self._diagnose(self.state, _stack(batches), np.stack(realized))
         return {name: np.asarray(value) for name, value in metrics.items()}
 
-    def policies(self) -> list[NumpyPolicy]:
+    def policies(self) -> list[Acting]:
         """Each seed's policy as learned."""
         return self._on_host(*jax.vmap(self.agent.policy)(self.state))
 
-    def behaviors(self) -> tuple[list[NumpyPolicy], np.ndarray]:
+    def behaviors(self) -> tuple[list[Acting], np.ndarray]:
         """Each seed's policy for collecting, and the standard deviations of the noise."""
         policy, normalizer, std = jax.vmap(self.agent.behavior)(self.state)
         return self._on_host(policy, normalizer), np.asarray(std)
 
-    def _on_host(self, policy: Policy | GaussianPolicy, normalizer: Normalizer) -> list[NumpyPolicy]:
-        pair = jax.device_get((policy, normalizer))
-        return [NumpyPolicy(policy_arrays(*jax.tree.map(lambda x, i=i: x[i], pair))) for i in range(len(self._keys))]
+    def _on_host(self, policy: Policy | GaussianPolicy | Planner, normalizer: Normalizer) -> list[Acting]:
+        pairs = jax.device_get((policy, normalizer))
+        each = [jax.tree.map(lambda x, i=i: x[i], pairs) for i in range(len(self._keys))]
+        if isinstance(policy, Planner):
+            return [PlanningPolicy(planner) for planner, _ in each]
+        return [NumpyPolicy(policy_arrays(*pair)) for pair in each]
 
     def snapshot(self, index: int) -> dict[str, np.ndarray]:
         """One seed's whole state as named arrays."""
         leaves = jax.tree_util.tree_leaves_with_path(self.state)
-        return {_name(path): np.asarray(leaf[index]) for path, leaf in leaves}
+        return {leaf_name(path): np.asarray(leaf[index]) for path, leaf in leaves}
 
     def restore(self, snapshots: Sequence[Mapping[str, np.ndarray]]) -> None:
         """Put back what `snapshot` gave, for every seed.
@@ -81,7 +86,7 @@ class Learner:
         """
 
         def put(path: Any, leaf: jax.Array) -> jax.Array:
-            name, arrays = _name(path), []
+            name, arrays = leaf_name(path), []
             for snapshot in snapshots:
                 found = snapshot.get(name)
                 if found is None or found.shape != leaf.shape[1:] or found.dtype != leaf.dtype:
@@ -125,8 +130,3 @@ def _compile(phase: Phase) -> Any:
 def _stack(items: Sequence[Any]) -> Any:
     """Join one pytree per seed along a new leading axis."""
     return jax.tree.map(lambda *leaves: np.stack(leaves), *items)
-
-
-def _name(path: Any) -> str:
-    """A state leaf's name, as in `actor/mlp/hidden/0/weight`."""
-    return "/".join(str(getattr(key, "name", getattr(key, "idx", getattr(key, "key", key)))) for key in path)

@@ -12,10 +12,9 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from mbdpg.envs import episode_seed
-from mbdpg.interfaces import Environment, Metrics, Phase, flag_of, require, require_settings
-from mbdpg.networks.policy import NumpyPolicy
+from mbdpg.interfaces import Acting, Environment, Metrics, Phase, flag_of, require, require_settings
 from mbdpg.training.collector import Collector
-from mbdpg.training.evaluation import Evaluation, diagnosis_windows, evaluate
+from mbdpg.training.evaluation import Evaluation, StoppedError, diagnosis_windows, evaluate
 from mbdpg.training.learner import Learner
 from mbdpg.training.randomness import random_stream
 
@@ -54,10 +53,6 @@ class Update(NamedTuple):
     """Last finished training episode of each seed; NaN before the first."""
     evaluation: list[Evaluation] | None
     """One per seed, when there was one."""
-
-
-class StoppedError(Exception):
-    """Asked to stop in the middle of an evaluation; a resumed run begins it again."""
 
 
 @runtime_checkable
@@ -161,10 +156,10 @@ class Training:
     def _due(self, every: int) -> bool:
         return self.env_steps % every == 0 or self.env_steps == self.schedule.steps
 
-    def _collect(self, policies: Sequence[NumpyPolicy], stds: np.ndarray) -> None:
+    def _collect(self, policies: Sequence[Acting], stds: np.ndarray) -> None:
         began = time.monotonic()
         for collector, policy, std in zip(self.collectors, policies, stds, strict=True):
-            collector.collect(policy.explore, float(std), self.schedule.cycle)
+            collector.collect(policy, float(std), self.schedule.cycle)
         self.env_steps += self.schedule.cycle
         self._seconds["acting"] += time.monotonic() - began
 
@@ -213,7 +208,7 @@ class Training:
             ]
             # A fresh environment: a resumed run has no used one, and a fault must not outlive its evaluation.
             with contextlib.closing(self._make_env()) as env:
-                evaluations.append(evaluate(env, _stoppable(policy, should_stop), seeds))
+                evaluations.append(evaluate(env, policy, seeds, should_stop=should_stop))
         metrics = self._diagnose(evaluations)
         self._seconds["evaluating"] += time.monotonic() - began
         for index, (recorder, evaluation) in enumerate(zip(self._recorders, evaluations, strict=True)):
@@ -262,14 +257,3 @@ class Training:
         """Seconds since this process began the run, and where they went."""
         parts = {f"time/{name}": seconds for name, seconds in self._seconds.items()}
         return {"time/seconds": time.monotonic() - self._began} | parts
-
-
-def _stoppable(policy: NumpyPolicy, should_stop: Callable[[], bool]) -> Callable[[np.ndarray], np.ndarray]:
-    """The policy, until asked to stop: an episode of somebody's environment may take minutes, or never end."""
-
-    def act(observation: np.ndarray) -> np.ndarray:
-        if should_stop():
-            raise StoppedError
-        return policy(observation)
-
-    return act

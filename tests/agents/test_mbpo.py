@@ -37,12 +37,13 @@ def state() -> State:
     fresh = agent().init(key=jax.random.key(0))
 
     def networks(x: State) -> Any:
-        return x.ensemble, x.soft.actor, x.soft.critics
+        return x.world.ensemble, x.soft.actor, x.soft.critics
 
     moved = jax.tree.map(lambda x: x + jnp.asarray(rng.normal(0, 0.2, x.shape), jnp.float32), networks(fresh))
     moved = eqx.tree_at(networks, fresh, moved)
-    moved = eqx.tree_at(lambda x: x.ensemble.members.output.bias, moved, replace_fn=lambda x: x.at[:, -1].set(0.0))
-    return agent().prepare(eqx.tree_at(lambda x: x.errors, moved, jnp.asarray([3.0, 1.0, 2.0])), statistics())
+    biases = moved.world.ensemble.members.output.bias.at[:, -1].set(0.0)
+    moved = eqx.tree_at(lambda x: x.world.ensemble.members.output.bias, moved, biases)
+    return agent().prepare(eqx.tree_at(lambda x: x.world.errors, moved, jnp.asarray([3.0, 1.0, 2.0])), statistics())
 
 
 def batch(size: int, seed: int = 1) -> Batch:
@@ -74,15 +75,15 @@ def moved(before: Any, after: Any) -> set[str]:
 
 
 def test_phases_come_in_the_order_in_which_each_needs_the_one_before() -> None:
-    assert [phase.name for phase in agent().phases] == ["fitting", "validating", "imagining", "improving"]
+    assert [phase.name for phase in agent().phases] == ["fitting", "judging", "imagining", "improving"]
     assert all(phase.after_steps == agent().config.random_steps for phase in agent().phases)
 
 
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
-        ("fitting", {"ensemble", "ensemble_optimizer"}),
-        ("validating", {"errors"}),
+        ("fitting", {"world"}),
+        ("judging", {"world"}),
         ("imagining", {"imagined"}),
         ("improving", {"soft"}),
     ],
@@ -91,23 +92,28 @@ def test_a_phase_moves_its_own_part_alone(name: str, expected: set[str]) -> None
     assert moved(state(), take(name, state())[0]) == expected
 
 
+def test_fitting_and_judging_move_different_parts_of_the_world() -> None:
+    assert moved(state().world, take("fitting", state())[0].world) == {"ensemble", "optimizer"}
+    assert moved(state().world, take("judging", state())[0].world) == {"errors"}
+
+
 def test_fitting_moves_every_parameter_of_every_member() -> None:
     after, _ = take("fitting", state())
-    for old, new in zip(jax.tree.leaves(state().ensemble), jax.tree.leaves(after.ensemble), strict=True):
+    for old, new in zip(jax.tree.leaves(state().world.ensemble), jax.tree.leaves(after.world.ensemble), strict=True):
         assert all((old[i] != new[i]).any() for i in range(3))
 
 
 def test_learning_steps_are_never_the_ones_that_judge() -> None:
     parts = {phase.name: phase.sampling.part for phase in agent().phases}
-    assert parts == {"fitting": "kept", "validating": "held-out", "imagining": "all", "improving": "all"}
+    assert parts == {"fitting": "kept", "judging": "held-out", "imagining": "all", "improving": "all"}
 
 
 def test_errors_are_a_running_average_and_begin_with_the_first() -> None:
-    zero = eqx.tree_at(lambda x: x.errors, state(), jnp.zeros(3))
-    first = take("validating", zero)[0].errors
+    zero = eqx.tree_at(lambda x: x.world.errors, state(), jnp.zeros(3))
+    first = take("judging", zero)[0].world.errors
     assert (first > 0).all()
-    second = take("validating", take("validating", zero)[0], seed=2)[0].errors
-    np.testing.assert_allclose(second, 0.5 * (first + take("validating", zero, seed=2)[0].errors), rtol=1e-5)
+    second = take("judging", take("judging", zero)[0], seed=2)[0].world.errors
+    np.testing.assert_allclose(second, 0.5 * (first + take("judging", zero, seed=2)[0].world.errors), rtol=1e-5)
 
 
 def imagined(length: int, env: EnvSpec = ENV, **settings: Any) -> tuple[Any, jax.Array]:
@@ -136,14 +142,14 @@ def test_a_rollout_is_the_actor_s_in_an_elite() -> None:
     mean, _ = state().soft.actor.sample(state().soft.normalizer(start), key=jax.random.key(5))
     assert not np.allclose(rows.action[0], mean)  # drawn, with a key of its own
     everywhere = predict(
-        state().ensemble,
-        state().units,
+        state().world.ensemble,
+        state().world.units,
         jnp.broadcast_to(start, (3, 10, O)),
         jnp.broadcast_to(rows.action[0], (3, 10, A)),
     )
     # Narrow Gaussians tell which member it was.
-    narrow = eqx.tree_at(lambda x: x.ensemble.members.max_log_variance, state(), jnp.full((3, O + 1), -20.0))
-    narrow = eqx.tree_at(lambda x: x.ensemble.members.min_log_variance, narrow, jnp.full((3, O + 1), -20.0))
+    narrow = eqx.tree_at(lambda x: x.world.ensemble.members.max_log_variance, state(), jnp.full((3, O + 1), -20.0))
+    narrow = eqx.tree_at(lambda x: x.world.ensemble.members.min_log_variance, narrow, jnp.full((3, O + 1), -20.0))
     after = take("imagining", narrow)[0].imagined.rows.next_observation[:10]
     distances = np.max(np.abs(np.asarray(everywhere.next_observation) - np.asarray(after)), axis=-1)
     used = np.argmin(distances, axis=0)
@@ -154,8 +160,8 @@ def test_a_rollout_is_the_actor_s_in_an_elite() -> None:
 def test_an_end_is_paid_by_its_own_head() -> None:
     rows, _ = imagined(1)
     everywhere = predict(
-        state().ensemble,
-        state().units,
+        state().world.ensemble,
+        state().world.units,
         jnp.broadcast_to(rows.observation[0], (3, 10, O)),
         jnp.broadcast_to(rows.action[0], (3, 10, A)),
     )
@@ -213,7 +219,7 @@ def test_a_batch_that_is_not_finite_moves_no_member_and_is_counted() -> None:
     bad = batch(phase.sampling.batch_size)
     bad = bad._replace(reward=bad.reward.at[0].set(jnp.inf))
     after, metrics = jax.jit(phase.update)(state(), bad, key=jax.random.key(0))
-    assert "ensemble" not in moved(state(), after) and metrics["dynamics/skipped"] == 1
+    assert "ensemble" not in moved(state().world, after.world) and metrics["dynamics/skipped"] == 1
 
 
 def test_instruments_are_sacs_and_the_ensembles() -> None:

@@ -70,7 +70,7 @@ def experience(probe: Probe, starts: list[float]) -> Batch:
 def learn(request: pytest.FixtureRequest) -> Callable[[Probe, list[float]], Learned]:
     """Train an agent on a probe; compiled once for all of them."""
     agent = AGENTS[request.param]
-    phases = [phase for phase in agent.phases if phase.name in ("fitting", "validating", "imagining", "improving")]
+    phases = [phase for phase in agent.phases if phase.name in ("fitting", "judging", "imagining", "improving")]
 
     @jax.jit
     def train(windows: Batch, key: jax.Array):

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import mbdpg
-from mbdpg.agents import mbdpg as model_based, mbpo, sac, td3
+from mbdpg.agents import mbdpg as model_based, mbpo, pets, sac, td3
 from mbdpg.interfaces import UserError
 from mbdpg.training.loop import Schedule
 
@@ -45,6 +45,11 @@ IMPOSSIBLE = [
     (sac.Config, "layers", 0),
     (sac.Config, "learning_rate", 0.0),
     (sac.Config, "entropy_per_action", float("inf")),
+    (pets.Config, "horizon", 0),
+    (pets.Config, "smoothing", 1.1),
+    (pets.Config, "discount", 1.01),
+    (pets.Config, "elites", 6),
+    (pets.Config, "plan_elites", 151),
     (mbpo.Config, "real_share", 1.5),
     (mbpo.Config, "elites", 8),
     (mbpo.Config, "rollout_length", 0),
@@ -92,9 +97,10 @@ def unread(config: type, files: list[Path], owners: set[str]) -> set[str]:
             [*((PACKAGE / "agents" / f"{name}.py") for name in ("sac", "mbpo")), COMPOSED],
             {"c", "config", "agent"},
         ),
+        (pets.Config, [PACKAGE / "agents" / "pets.py", COMPOSED], {"c", "config", "agent"}),
         (Schedule, [PACKAGE / "training" / "loop.py"], {"schedule", "_schedule"}),
     ],
-    ids=["mbdpg", "td3", "sac", "mbpo", "schedule"],
+    ids=["mbdpg", "td3", "sac", "mbpo", "pets", "schedule"],
 )
 def test_every_setting_is_read(config: type, files: list[Path], owners: set[str]) -> None:
     assert not unread(config, files, owners)

@@ -16,7 +16,7 @@ def spec(env: str) -> EnvSpec:
 @pytest.mark.filterwarnings("ignore:.*out of date")  # v4 is, on purpose
 @pytest.mark.parametrize("env", ["Hopper-v5", "Hopper-v4", "Walker2d-v5", "Ant-v5", "Ant-v4"])
 def test_a_rule_ends_where_the_simulator_does(env: str) -> None:
-    simulator, rule, ends = gymnasium.make(env), known_rule(spec(env)), 0
+    simulator, rule, ends = gymnasium.make(env), RULES[known_rule(spec(env))], 0
     simulator.action_space.seed(0)
     after, expected = [], []
     for episode in range(40):

@@ -129,7 +129,7 @@ def test_a_preset_names_nothing_that_the_config_does_not_have(algorithm: str) ->
 
 
 def test_unknown_names_are_refused_with_the_known_ones() -> None:
-    with pytest.raises(UserError, match="unknown --algorithm 'ppo'; expected one of mbdpg, td3, sac, mbpo"):
+    with pytest.raises(UserError, match="unknown --algorithm 'ppo'; expected one of mbdpg, td3, sac, pets, mbpo"):
         agent_config("ppo", "default")
     with pytest.raises(UserError, match="unknown --preset 'big'; expected default or paper"):
         agent_config("mbdpg", "big")

@@ -100,6 +100,7 @@ EVERY_CASE = [("td3", "Pendulum-v1"), ("td3", LUNAR), ("mbdpg", "Pendulum-v1"), 
         ("td3", LUNAR, [5]),
         ("sac", "Pendulum-v1", [4]),
         ("mbpo", LUNAR, [5]),
+        ("pets", "Pendulum-v1", [4]),
         ("mbdpg", "Pendulum-v1", [4]),
         *(pytest.param(*case, [0, 2, 4, 6, 8], marks=pytest.mark.slow) for case in EVERY_CASE),
     ],
@@ -263,7 +264,7 @@ def test_a_longer_run_begins_where_the_shorter_ended(toy_run: Path, tmp_path: Pa
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"algorithm": "ppo"}, "config.json has algorithm 'ppo', expected mbdpg, td3, sac, mbpo"),
+        ({"algorithm": "ppo"}, "config.json has algorithm 'ppo', expected mbdpg, td3, sac, pets, mbpo"),
         ({"env": None}, "does not say which environment"),
         ({"agent": None}, "config.json has no agent"),
         ({"agent": {"width": 4}}, "config.json does not fit this version of mbdpg: agent differs in"),

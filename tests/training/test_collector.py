@@ -85,12 +85,26 @@ def policy(observation: np.ndarray) -> np.ndarray:
     return np.tanh(observation[:1])
 
 
-def explore(observation: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    return np.clip(policy(observation) + noise, -1, 1).astype(np.float32)
+class Explorer:
+    """A policy that explores, and counts what it was asked."""
+
+    def __init__(self, of_observation: float = 1.0):
+        self.arrays: dict[str, np.ndarray] = {}
+        self.asked, self.resets = 0, 0
+        self._share = of_observation
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        return self._share * policy(observation)
+
+    def explore(self, observation: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        self.asked += 1
+        return np.clip(self(observation) + noise, -1, 1).astype(np.float32)
+
+    def reset(self) -> None:
+        self.resets += 1
 
 
-def noise_alone(observation: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    return np.clip(noise, -1, 1).astype(np.float32)
+explore, noise_alone = Explorer(), Explorer(0.0)
 
 
 def collector(world: World, *, seed: int = 3, random_steps: int = 10, scatter: float = 1.0) -> Collector:
@@ -110,16 +124,22 @@ def failing_at(*moments: int, error: Exception | None = None) -> Fault:
 
 
 def test_the_first_steps_are_uniform_and_know_no_policy() -> None:
-    world, asked = World(), []
+    world, explorer = World(), Explorer()
     made = collector(world, random_steps=2000)
-    made.collect(lambda *given: asked.append(1) or explore(*given), 0.3, 2000)
+    made.collect(explorer, 0.3, 2000)
     actions = np.concatenate(world.actions)
     assert actions.dtype == np.float32
     assert np.abs(actions).max() <= 1
     assert abs(actions.mean()) < 0.04 and abs(actions.std() - np.sqrt(1 / 3)) < 0.03
-    assert not asked
-    made.collect(lambda *given: asked.append(1) or explore(*given), 0.3, 1)
-    assert asked
+    assert not explorer.asked
+    made.collect(explorer, 0.3, 1)
+    assert explorer.asked == 1
+
+
+def test_the_policy_hears_of_every_new_episode() -> None:
+    explorer, made = Explorer(), collector(World())
+    made.collect(explorer, 0.3, 500)
+    assert explorer.resets == made.episode + made.replay.episode_open > 3
 
 
 def test_after_them_the_policy_acts_with_noise_of_the_given_size_inside_the_bounds() -> None:

@@ -9,7 +9,8 @@ import jax
 import numpy as np
 import pytest
 
-from mbdpg.agents import mbdpg, mbpo, sac, td3
+from mbdpg.agents import mbdpg, mbpo, pets, sac, td3
+from mbdpg.dynamics.planning import Planner, PlanningPolicy
 from mbdpg.interfaces import Agent, Batch, EnvSpec, UserError
 from mbdpg.training.learner import Learner
 from mbdpg.training.replay import Replay
@@ -29,6 +30,11 @@ def make_sac(**settings: Any) -> Agent:
 def make_mbpo(**settings: Any) -> Agent:
     small = {"members": 2, "elites": 1, "model_width": 4, "fit_batch_size": 3, "rollouts_per_step": 1}
     return mbpo.MBPO(mbpo.Config(**(TINY | small | {"imagine_every": 4, "retained_steps": 8} | settings)), SPEC)
+
+
+def make_pets(**settings: Any) -> Agent:
+    small = {"members": 2, "elites": 1, "model_width": 4, "fit_batch_size": 3, "horizon": 2, "population": 4}
+    return pets.PETS(pets.Config(**(small | {"plan_elites": 2} | settings)), SPEC)
 
 
 def make_mbdpg(**settings: Any) -> Agent:
@@ -80,9 +86,11 @@ class Two(NamedTuple):
     metrics_alone: list[dict[str, np.ndarray]]
 
 
-@pytest.fixture(scope="module", params=["toy", "td3", "sac", "mbpo", pytest.param("mbdpg", marks=pytest.mark.slow)])
+@pytest.fixture(
+    scope="module", params=["toy", "td3", "sac", "pets", "mbpo", pytest.param("mbdpg", marks=pytest.mark.slow)]
+)
 def two(request: pytest.FixtureRequest, toy: Any) -> Two:
-    makers = {"td3": make_td3, "sac": make_sac, "mbpo": make_mbpo, "mbdpg": make_mbdpg}
+    makers = {"td3": make_td3, "sac": make_sac, "pets": make_pets, "mbpo": make_mbpo, "mbdpg": make_mbdpg}
     make = (makers | {"toy": lambda: toy.ToyAgent(SPEC)})[request.param]
     together, alone = Learner(make(), [4, 9]), Learner(make(), [9])
     return Two(together, alone, learn(together, [4, 9]), learn(alone, [9]))
@@ -169,6 +177,9 @@ def test_policies_on_the_host_are_the_state_s(two: Two) -> None:
     one = jax.tree.map(lambda x: x[1], two.together.state)
     chosen = (policies, two.together.agent.behavior(one)), (two.together.policies(), two.together.agent.policy(one))
     for found, (policy, normalizer, *_) in chosen:
+        if isinstance(policy, Planner):
+            np.testing.assert_array_equal(found[1](observation), PlanningPolicy(policy)(observation))
+            continue
         expected = getattr(policy, "center", policy)(normalizer(jax.numpy.asarray(observation)))
         np.testing.assert_allclose(found[1](observation), expected, atol=1e-6)
     assert stds.shape == (2,) and (stds >= 0).all()

@@ -1,0 +1,202 @@
+"""Acting by planning: the cross-entropy method on rollouts of an ensemble (Chua et al. 2018, Algorithm 1)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from mbdpg.dynamics.ensemble import Ensemble, Units, predict
+from mbdpg.dynamics.termination import RULES
+from mbdpg.networks.leaves import leaf_name
+
+
+def cross_entropy(
+    score: Callable[[Float[Array, "plan time action"]], Float[Array, " plan"]],
+    mean: Float[Array, "time action"],
+    *,
+    population: int,
+    elites: int,
+    iterations: int,
+    smoothing: float,
+    key: PRNGKeyArray,
+) -> Float[Array, "time action"]:
+    """The mean of a Gaussian over action sequences in [-1, 1] that is moved to its best draws again and again.
+
+    As in the authors' code: draws within two standard deviations, and a variance that keeps those within the bounds.
+
+    Args:
+        score: what to maximize.
+        mean: where to begin; the standard deviation begins at a quarter of the action range.
+        population: sequences drawn per iteration.
+        elites: of which so many decide the next Gaussian.
+        iterations: how often.
+        smoothing: share of the old mean and variance that is kept.
+        key: decides the draws.
+    """
+
+    def iterate(carry: tuple[Array, Array], key: Array) -> tuple[tuple[Array, Array], None]:
+        mean, variance = carry
+        room = jnp.square(jnp.minimum(mean + 1.0, 1.0 - mean) / 2.0)
+        std = jnp.sqrt(jnp.minimum(variance, room))
+        plans = mean[None] + std[None] * jax.random.truncated_normal(key, -2.0, 2.0, (population, *mean.shape))
+        best = plans[jax.lax.top_k(score(plans), elites)[1]]
+        mean = smoothing * mean + (1.0 - smoothing) * jnp.mean(best, axis=0)
+        return (mean, smoothing * variance + (1.0 - smoothing) * jnp.var(best, axis=0)), None
+
+    begin = (mean, jnp.full_like(mean, 0.25))
+    return jax.lax.scan(iterate, begin, jax.random.split(key, iterations))[0][0]
+
+
+class Planner(eqx.Module):
+    """What is needed to plan: a learned world, and how far and how hard to think."""
+
+    ensemble: Ensemble
+    units: Units
+    horizon: int = eqx.field(static=True)
+    """Steps of a plan."""
+    particles: int = eqx.field(static=True)
+    """Imagined rollouts of every plan and member; each stays with its member (TS-infinity)."""
+    population: int = eqx.field(static=True)
+    elites: int = eqx.field(static=True)
+    iterations: int = eqx.field(static=True)
+    smoothing: float = eqx.field(static=True)
+    discount: float = eqx.field(static=True)
+    rule: str | None = eqx.field(static=True)
+    """Name of the known rule by which episodes end; None if the ensemble knows."""
+
+    @property
+    def action_size(self) -> int:
+        return int(self.ensemble.members.hidden[0].weight.shape[-2]) - self.units.delta.shape[-1]
+
+    def imagined_return(
+        self, observation: Float[Array, " observation"], plans: Float[Array, "plan time action"], *, key: PRNGKeyArray
+    ) -> Float[Array, " plan"]:
+        """Mean over members and particles of the discounted reward that each plan earns while it survives."""
+        members, count = self.ensemble.members.output.bias.shape[0], plans.shape[0]
+        lead = (members, count * self.particles)
+        start = jnp.broadcast_to(observation, (*lead, observation.shape[0]))
+
+        def step(carry: tuple[Array, Array], inputs: tuple[Array, Array]) -> tuple[tuple[Array, Array], Array]:
+            (state, alive), (action, key) = carry, inputs
+            action = jnp.broadcast_to(jnp.repeat(action, self.particles, axis=0), (*lead, action.shape[-1]))
+            imagined = predict(self.ensemble, self.units, state, action, key=key)
+            goes_on = imagined.continues
+            if self.rule is not None:
+                goes_on = RULES[self.rule](imagined.next_observation).astype(jnp.float32)
+            reward = alive * (goes_on * imagined.reward + (1.0 - goes_on) * imagined.terminal_reward)
+            return (imagined.next_observation, self.discount * alive * goes_on), reward
+
+        inputs = (jnp.swapaxes(plans, 0, 1), jax.random.split(key, self.horizon))
+        _, rewards = jax.lax.scan(step, (start, jnp.ones(lead)), inputs)
+        total = jnp.sum(rewards, axis=0).reshape(members, count, self.particles)
+        found = jnp.mean(total, axis=(0, 2))
+        # An imagined state that ran away must not win; to take the largest of it and a NaN would be a NaN.
+        return jnp.where(jnp.isfinite(found), found, -jnp.inf)
+
+    def plan(
+        self, observation: Float[Array, " observation"], before: Float[Array, "time action"], *, key: PRNGKeyArray
+    ) -> Float[Array, "time action"]:
+        """The best sequence found from a raw observation, beginning from another."""
+        noise_key, search_key = jax.random.split(key)
+        return cross_entropy(
+            lambda plans: self.imagined_return(observation, plans, key=noise_key),
+            before,
+            population=self.population,
+            elites=self.elites,
+            iterations=self.iterations,
+            smoothing=self.smoothing,
+            key=search_key,
+        )
+
+
+@eqx.filter_jit
+def _next(planner: Planner, observation: Array, before: Array, step: Array) -> tuple[Array, Array]:
+    """The action now, and what is left of the plan for the step after."""
+    plan = planner.plan(observation, before, key=jax.random.fold_in(jax.random.key(0), step))
+    return plan[0], jnp.concatenate([plan[1:], jnp.zeros_like(plan[:1])])
+
+
+class PlanningPolicy:
+    """Plans anew at every step, beginning from what was planned one step before."""
+
+    def __init__(self, planner: Planner):
+        """Begin without a plan."""
+        self.arrays = planner_arrays(planner)
+        self.observation_size, self.action_size = planner.units.delta.shape[0], planner.action_size
+        self._planner = planner
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the plan: a new episode begins."""
+        self._step = 0
+        self._plan: Array = jnp.zeros((self._planner.horizon, self.action_size))
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """The action, float32 in [-1, 1] of shape (action,), for a raw observation of shape (observation,)."""
+        seen = jnp.asarray(observation, jnp.float32)
+        if seen.shape != (self.observation_size,):
+            raise ValueError(f"the policy takes observations of shape ({self.observation_size},), not {seen.shape}")
+        action, self._plan = _next(self._planner, seen, self._plan, jnp.uint32(self._step))
+        self._step += 1
+        return np.asarray(action)
+
+    def explore(self, observation: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """The action with noise added to it."""
+        return np.clip(self(observation) + noise, -1.0, 1.0).astype(np.float32)
+
+
+_NUMBERS = ("horizon", "particles", "population", "elites", "iterations", "smoothing", "discount")
+_HIDDEN = "ensemble/members/hidden/"
+
+
+def planner_arrays(planner: Planner) -> dict[str, np.ndarray]:
+    """A planner as named arrays, for a policy file."""
+    arrays = {f"planner/{name}": np.asarray(getattr(planner, name)) for name in _NUMBERS}
+    arrays["planner/rule"] = np.frombuffer((planner.rule or "").encode(), np.uint8)
+    leaves = jax.tree_util.tree_leaves_with_path(planner)
+    return arrays | {leaf_name(path): np.asarray(leaf) for path, leaf in leaves}
+
+
+def is_planner(arrays: Mapping[str, np.ndarray]) -> bool:
+    """Whether these are what `planner_arrays` gives, and not a policy network's."""
+    return "planner/rule" in arrays
+
+
+def planner_of(arrays: Mapping[str, np.ndarray]) -> Planner:
+    """Build the planner that `planner_arrays` took apart, perhaps a stranger's.
+
+    Raises:
+        ValueError: an array is missing, misshapen or not finite, or a setting is impossible.
+    """
+    try:
+        numbers = {name: arrays[f"planner/{name}"].item() for name in _NUMBERS}
+        rule = arrays["planner/rule"].tobytes().decode("ascii") or None
+        layers = sum(name.startswith(_HIDDEN) and name.endswith("/weight") for name in arrays)
+        count, inputs, _ = arrays[f"{_HIDDEN}0/weight"].shape
+        widths = tuple(int(arrays[f"{_HIDDEN}{i}/weight"].shape[-1]) for i in range(layers))
+        (size,) = arrays["units/delta"].shape
+    except (KeyError, IndexError, ValueError) as error:
+        raise ValueError(f"the planner is not whole ({error})") from error
+    whole = [numbers[name] for name in ("horizon", "particles", "population", "elites", "iterations")]
+    possible = all(isinstance(number, int) and 0 < number <= 10**6 for number in whole)
+    if not possible or numbers["elites"] > numbers["population"] or inputs <= size or rule not in (None, *RULES):
+        raise ValueError(f"the planner has the impossible settings {numbers}, rule {rule!r}")
+
+    def fresh(key: PRNGKeyArray) -> Planner:
+        ensemble = Ensemble(size, inputs - size, count=count, widths=widths, key=key)
+        return Planner(ensemble=ensemble, units=Units.raw(size), rule=rule, **numbers)
+
+    def take(path: Any, leaf: jax.ShapeDtypeStruct) -> Array:
+        name = leaf_name(path)
+        found = arrays.get(name)
+        if found is None or (found.shape, found.dtype) != (leaf.shape, leaf.dtype) or not np.isfinite(found).all():
+            raise ValueError(f"the planner's array {name} is not {leaf.dtype}{list(leaf.shape)} of finite numbers")
+        return jnp.asarray(found)
+
+    return jax.tree_util.tree_map_with_path(take, jax.eval_shape(fresh, jax.random.key(0)))
