@@ -28,14 +28,21 @@ class Linear(eqx.Module):
     weight: Float[Array, "inputs outputs"]
     bias: Float[Array, " outputs"]
 
-    def __init__(self, inputs: int, outputs: int, *, scale: float = 1.0, key: PRNGKeyArray):
+    def __init__(self, inputs: int, outputs: int, *, scale: float = 1.0, uniform: bool = False, key: PRNGKeyArray):
         """Draw weights with standard deviation `scale / sqrt(inputs)`; biases are zero.
 
-        The paper's N(0, 1) would give a 256-wide layer pre-activations of standard deviation 16, which saturates
+        `uniform` is PyTorch's own start, with which TD3's authors published: weights and biases of up to
+        1 / sqrt(inputs), whatever the scale. The paper's N(0, 1) would give a 256-wide layer pre-activations of standard deviation 16, which saturates
         every gate and the policy's tanh (docs/deviations.md).
         """
-        self.weight = jax.random.normal(key, (inputs, outputs)) * (scale / math.sqrt(inputs))
-        self.bias = jnp.zeros(outputs)
+        spread = 1.0 / math.sqrt(inputs)
+        if uniform:
+            weight_key, bias_key = jax.random.split(key)
+            self.weight = jax.random.uniform(weight_key, (inputs, outputs), minval=-spread, maxval=spread)
+            self.bias = jax.random.uniform(bias_key, (outputs,), minval=-spread, maxval=spread)
+        else:
+            self.weight = jax.random.normal(key, (inputs, outputs)) * (scale * spread)
+            self.bias = jnp.zeros(outputs)
 
     def __call__(self, x: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
         return x @ self.weight + _along(self.bias, x)
@@ -75,12 +82,16 @@ class MLP(eqx.Module):
         plain: bool = False,
         key: PRNGKeyArray,
     ):
-        """Build the layers; `output_scale` 0 makes the network start as the constant zero, `plain` is with ReLU."""
+        """Build the layers; `output_scale` 0 makes the network start as the constant zero.
+
+        `plain` is with ReLU, and with PyTorch's start in every layer.
+        """
         sizes = [inputs, *widths]
         keys = jax.random.split(key, len(sizes))
-        self.hidden = tuple(Linear(a, b, key=k) for a, b, k in zip(sizes, widths, keys[:-1], strict=False))
+        layers = zip(sizes, widths, keys[:-1], strict=False)
+        self.hidden = tuple(Linear(a, b, uniform=plain, key=k) for a, b, k in layers)
         self.norms = () if plain else tuple(LayerNorm(width) for width in widths)
-        self.output = Linear(sizes[-1], outputs, scale=output_scale, key=keys[-1])
+        self.output = Linear(sizes[-1], outputs, scale=output_scale, uniform=plain, key=keys[-1])
 
     def __call__(self, x: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
         return self.output(self.features(x))

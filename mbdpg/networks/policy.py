@@ -43,7 +43,7 @@ class GaussianPolicy(eqx.Module):
     def __init__(self, observation: int, action: int, widths: Sequence[int], *, plain: bool = False, key: PRNGKeyArray):
         center_key, spread_key = jax.random.split(key)
         self.center = Policy(observation, action, widths, plain=plain, key=center_key)
-        self.spread = Linear([observation, *widths][-1], action, scale=0.01, key=spread_key)
+        self.spread = Linear([observation, *widths][-1], action, scale=0.01, uniform=plain, key=spread_key)
 
     def sample(
         self, observation: Float[Array, "*batch observation"], *, key: PRNGKeyArray

@@ -55,6 +55,15 @@ def test_a_plain_network_has_relus_and_no_norms(key: jax.Array) -> None:
     assert not mlp.norms
 
 
+def test_a_plain_network_starts_as_pytorch_s(key: jax.Array) -> None:
+    mlp = MLP(400, (300, 100), 2, output_scale=0.0, plain=True, key=key)
+    for linear in (*mlp.hidden, mlp.output):
+        bound = 1 / np.sqrt(linear.weight.shape[0])
+        assert 0.98 * bound < np.abs(linear.weight).max() <= bound and abs(linear.weight.mean()) < 0.1 * bound
+        assert float(linear.weight.std()) == pytest.approx(bound / np.sqrt(3), rel=0.05)
+        assert 0 < np.abs(linear.bias).max() <= bound and not np.isin(linear.bias, linear.weight).any()
+
+
 def test_without_hidden_layers_a_network_is_affine(key: jax.Array) -> None:
     mlp = shaken(MLP(3, (), 2, key=key), np.random.default_rng(1))
     x = jnp.asarray([[1.0, -2.0, 0.5]])
