@@ -31,9 +31,9 @@ class Linear(eqx.Module):
     def __init__(self, inputs: int, outputs: int, *, scale: float = 1.0, uniform: bool = False, key: PRNGKeyArray):
         """Draw weights with standard deviation `scale / sqrt(inputs)`; biases are zero.
 
-        `uniform` is PyTorch's own start, with which TD3's authors published: weights and biases of up to
-        1 / sqrt(inputs), whatever the scale. The paper's N(0, 1) would give a 256-wide layer pre-activations of standard deviation 16, which saturates
-        every gate and the policy's tanh (docs/deviations.md).
+        The paper's N(0, 1) would give a 256-wide layer pre-activations of standard deviation 16, which saturates
+        every gate and the policy's tanh (docs/deviations.md). `uniform` is PyTorch's start, with which TD3's authors
+        published: weights and biases of up to 1 / sqrt(inputs), whatever the scale.
         """
         spread = 1.0 / math.sqrt(inputs)
         if uniform:
