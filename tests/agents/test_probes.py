@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mbdpg.agents import mbdpg, mbpo, sac, td3
+from mbdpg.agents import mbdpg, mbpo, pets, sac, td3
 from mbdpg.dynamics import mixture
+from mbdpg.dynamics.planning import Planner
 from mbdpg.interfaces import Agent, Batch, EnvSpec
 
 ROWS, STEPS, BATCH, UPDATES, GAMMA = 512, 3, 32, 800, 0.5
@@ -29,6 +30,13 @@ AGENTS: dict[str, Agent] = {
             **{**NETWORKS, **SOFT, "real_share": 0.5, "members": 3, "elites": 2, "model_width": 16},
             **{"model_learning_rate": 3e-3, "fit_batch_size": BATCH, "rollouts_per_step": 32, "imagine_every": 1},
             retained_steps=20,
+        ),
+        ENV,
+    ),
+    "pets": pets.PETS(
+        pets.Config(
+            **{"members": 3, "elites": 2, "model_width": 16, "model_learning_rate": 3e-3, "fit_batch_size": BATCH},
+            **{"discount": GAMMA, "horizon": 6, "population": 200, "plan_elites": 20, "iterations": 20},
         ),
         ENV,
     ),
@@ -93,11 +101,22 @@ def learn(request: pytest.FixtureRequest) -> Callable[[Probe, list[float]], Lear
             # Where nothing is random the likelihood's gradient grows by the hundred and starves the reward's.
             patch.setattr(mixture, "LOG_STD_MIN", -1.0)
             state = train(experience(probe, starts), jax.random.key(0))
+        if isinstance(agent, pets.PETS):
+            return planned(agent.policy(state)[0])
         critics = state.soft.critics if isinstance(state, mbpo.State) else state.critics
         return Learned(
             value=lambda observation, action: float(jnp.min(critics(one(observation), one(action)))),
             action=lambda observation: float(agent.policy(state)[0](one(observation))[0]),
         )
+
+    def planned(planner: Planner) -> Learned:
+        plan = jax.jit(lambda x: planner.plan(x, jnp.zeros((planner.horizon, 1)), key=jax.random.key(1)))
+
+        def value(observation: float, action: float) -> float:
+            plans = plan(one(observation)).at[0].set(action)[None]
+            return float(planner.imagined_return(one(observation), plans, key=jax.random.key(2))[0])
+
+        return Learned(value, lambda observation: float(plan(one(observation))[0, 0]))
 
     return learned
 
