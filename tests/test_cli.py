@@ -387,6 +387,22 @@ def test_the_last_of_two_algorithms_is_the_one_that_is_trained(say: Any, toys: N
     assert RunFolder.open(Path("run/seed-0")).config["algorithm"] == "td3"
 
 
+def test_report_compares_runs_and_draws_them(say: Any, toys: None) -> None:
+    for seed in ("0", "1"):
+        assert say("train", "Pendulum-v1", *TINY, "--seeds", seed, "--out", f"runs/{seed}").status == 0
+    said = say("report", "runs", "--out", "pictures")
+    assert said.status == 0, said.err
+    lines = said.out.splitlines()
+    assert lines[0] == "Pendulum-v1" and lines[1].startswith("return at 40 steps: ")
+    assert lines[2].startswith("  td3 (2 seeds): -") and lines[3] == "  learning curves in pictures/Pendulum-v1.png"
+    assert Path("pictures/Pendulum-v1.png").read_bytes().startswith(b"\x89PNG")
+    check_refused(say("report", "pictures"), "pictures is no run folder and has none in it")
+    check_refused(
+        say("report", "runs", "--at", "30"), "--at is 30, expected a step at which all were evaluated: 0, 20, 40"
+    )
+    check_refused(say("report"), "expected run folders")
+
+
 def test_a_run_that_ends_before_it_learns_says_so(say: Any, toys: None) -> None:
     said = say("train", "Pendulum-v1", *TINY, "--random-steps", "40", "--out", "run")
     assert said.status == 0

@@ -19,6 +19,7 @@ import tyro
 from mbdpg import envs
 from mbdpg.cli.compilations import keep_compilations
 from mbdpg.cli.flags import parse, peek, program
+from mbdpg.cli.report import report
 from mbdpg.cli.stopping import Stop
 from mbdpg.experiments import benchmark, expert, presets
 from mbdpg.experiments.config import AgentConfig, EnvOptions, RunConfig
@@ -286,5 +287,6 @@ VERBS = {
     "resume": _resume,
     "evaluate": _evaluate,
     "demonstrate": _demonstrate,
+    "report": report,
     "benchmark": _benchmark,
 }

@@ -28,7 +28,7 @@ def draw_curves(groups: Mapping[str, Sequence[Path]], path: Path, *, title: str)
     Raises:
         UserError: no run has an evaluation yet, or the picture cannot be written.
     """
-    known = {label: [curve for curve in map(_curve, runs) if curve] for label, runs in groups.items()}
+    known = {label: [curve for curve in map(learning_curve, runs) if curve] for label, runs in groups.items()}
     if not any(known.values()):
         raise UserError("no run has an evaluation yet; train until the first one, then draw again")
     figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
@@ -53,7 +53,7 @@ def draw_curves(groups: Mapping[str, Sequence[Path]], path: Path, *, title: str)
         raise UserError(f"cannot write {path}: {error.strerror}") from error
 
 
-def _curve(run: Path) -> dict[int, float]:
+def learning_curve(run: Path) -> dict[int, float]:
     """Mean return by environment steps, without evaluations in which every episode failed."""
     rows = read_metrics(run, "eval")
     pairs = zip(rows["env_steps"], rows.get("eval/return_mean", []), strict=True)
