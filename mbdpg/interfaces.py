@@ -62,7 +62,7 @@ def require_settings(
         require(math.isfinite(value), f"{flag} is {value}, expected a finite number")
         if field.name in signed:
             continue
-        implied = {"learning_rate": 1.0, "s_per_step": 1000.0}
+        implied = {"learning_rate": 1.0, "updates_per_step": 1000.0, "fits_per_step": 1000.0}
         bound = at_most.get(field.name) or next((x for end, x in implied.items() if field.name.endswith(end)), math.inf)
         fits = value > 0 if field.name in positive else value >= 0
         least = "above 0" if field.name in positive else "of at least 0" if bound == math.inf else "from 0"
@@ -119,6 +119,8 @@ class Acting(Protocol):
 
     arrays: dict[str, np.ndarray]
     """What it is made of, by name: the content of a policy file."""
+    memory: list[float]
+    """What it carries from one step to the next; a checkpoint holds it, so that a resumed run goes on with it."""
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """The action, in [-1, 1], for a raw observation."""
@@ -181,7 +183,7 @@ class Statistics(NamedTuple):
     progress: Any
     """0 while recent training returns are a random policy's, 1 once they reach the reference return."""
     steps: Any
-    """How many steps there are."""
+    """How many steps there are, those of demonstrations aside."""
 
 
 class Phase(NamedTuple):

@@ -1,7 +1,7 @@
 """Put run folders beside Stable-Baselines3's: python results/agreement.py PEERS.csv... RUN...
 
 Writes peers.csv beside this file, every evaluation of both programs, and prints for each task and algorithm whether the
-means at the last step differ by less than the pooled standard deviation over seeds.
+means at the last step that all seeds share differ by less than the pooled standard deviation over seeds.
 """
 
 from __future__ import annotations
@@ -46,20 +46,24 @@ def main(paths: list[Path]) -> None:
         writer = csv.DictWriter(file, COLUMNS)
         writer.writeheader()
         writer.writerows(rows)
-    last: dict[tuple[str, str, str], dict[str, float]] = defaultdict(dict)
+    found: dict[tuple[str, str], dict[str, dict[str, dict[int, float]]]] = defaultdict(lambda: defaultdict(dict))
     for row in rows:
-        last[row["env"], row["algorithm"], row["program"]][row["seed"]] = float(row["return_mean"])
-    for env, algorithm in sorted({key[:2] for key in last}):
-        both = (last[env, algorithm, program].values() for program in ("mbdpg", "stable-baselines3"))
-        ours, peers = (np.array(list(returns)) for returns in both)
+        curve = found[row["env"], row["algorithm"]][row["program"]].setdefault(row["seed"], {})
+        curve[int(row["env_steps"])] = float(row["return_mean"])
+    for (env, algorithm), programs in sorted(found.items()):
+        curves = [curve for seeds in programs.values() for curve in seeds.values()]
+        step = max(set.intersection(*map(set, curves)))
+        both = (programs[program].values() for program in ("mbdpg", "stable-baselines3"))
+        ours, peers = (np.array([curve[step] for curve in curves]) for curves in both)
         if min(len(ours), len(peers)) < 2:
             continue
         pooled = np.sqrt((np.var(ours, ddof=1) + np.var(peers, ddof=1)) / 2)
         apart = abs(ours.mean() - peers.mean())
-        print(
-            f"{env} {algorithm}: mbdpg {ours.mean():.0f} {np.round(ours)}, peer {peers.mean():.0f} {np.round(peers)}, "
-            f"apart {apart:.0f}, pooled std {pooled:.0f}: {'agree' if apart < pooled else 'DIFFER'}"
-        )
+        verdict = "agree" if apart < pooled else "DIFFER"
+        print(f"{env} {algorithm} at {step:,}: apart {apart:.0f}, pooled std {pooled:.0f}: {verdict}")
+        for name, returns in (("mbdpg", ours), ("stable-baselines3", peers)):
+            each = np.round(returns).astype(int).tolist()
+            print(f"  {name}: {returns.mean():.0f} ± {returns.std(ddof=1):.0f}, {each}")
 
 
 if __name__ == "__main__":

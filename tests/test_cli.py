@@ -394,7 +394,7 @@ def test_report_compares_runs_and_draws_them(say: Any, toys: None) -> None:
     assert said.status == 0, said.err
     lines = said.out.splitlines()
     assert lines[0] == "Pendulum-v1" and lines[1].startswith("return at 40 steps: ")
-    assert lines[2].startswith("  td3 (2 seeds): -") and lines[3] == "  learning curves in pictures/Pendulum-v1.png"
+    assert lines[2].startswith("  td3 (2 runs): -") and lines[3] == "  learning curves in pictures/Pendulum-v1.png"
     assert Path("pictures/Pendulum-v1.png").read_bytes().startswith(b"\x89PNG")
     check_refused(say("report", "pictures"), "pictures is no run folder and has none in it")
     check_refused(

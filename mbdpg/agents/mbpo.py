@@ -33,7 +33,7 @@ class Config(sac.Config):
     imagine_every: int = 250
     """Environment steps between two times that rollouts are imagined, many at once."""
     retained_steps: int = 1000
-    """Environment steps whose rollouts are kept, as long as they have one step; longer ones crowd out sooner."""
+    """Environment steps whose rollouts are kept."""
     rollout_length: int = 1
     """Steps of a rollout at first."""
     final_rollout_length: int = 1
@@ -72,10 +72,8 @@ class Config(sac.Config):
             at_most=dict.fromkeys(shares, 1.0) | {"exploration_color": 2.0},
             signed=("entropy_per_action",),
         )
-        require(
-            self.elites <= self.members,
-            f"--elites is {self.elites}, expected at most as many as --members, {self.members}",
-        )
+        few = f"--elites is {self.elites}, expected at most as many as --members, {self.members}"
+        require(self.elites <= self.members, few)
         require(
             self.lengthen_from < self.lengthen_until,
             f"--lengthen-from is {self.lengthen_from}, expected less than --lengthen-until, {self.lengthen_until}",
@@ -116,7 +114,8 @@ class MBPO:
         self.env = env
         self._sac = sac.SAC(sac.Config(**{f.name: getattr(c, f.name) for f in fields(sac.Config)}), env)
         self._rule = RULES[known_rule(env)] if c.termination == "known" else None
-        self._fitting = Fitting(c.members, c.model_width, c.model_learning_rate, c.weight_decay, c.fit_batch_size)
+        rates = (c.model_learning_rate, c.weight_decay)
+        self._fitting = Fitting(c.members, c.model_width, *rates, c.fit_batch_size, judged=True)
         self._real = min(round(c.real_share * c.batch_size), c.batch_size)
         # As many for every elite.
         self._rollouts = c.elites * max(1, round(c.rollouts_per_step * c.imagine_every / c.elites))
@@ -175,13 +174,18 @@ class MBPO:
         return eqx.tree_at(lambda x: x.world, state, world), metrics
 
     def imagine(self, state: State, batch: Batch, *, key: PRNGKeyArray) -> tuple[State, Metrics]:
-        """Roll the actor out in the elites from real states; a rollout that ends begins again where it began."""
+        """Roll the actor out in the elites from real states, and keep one step of each rollout, all equally likely.
+
+        A rollout that ends begins again where it began.
+        """
         start = batch.observation[:, 0]
         elites = state.world.elites(self.config.elites)
+        roll_key, keep_key = jax.random.split(key)
+        wanted = jax.random.randint(keep_key, start.shape[:1], 0, state.rollout_length)
 
-        def step(t: Array, carry: tuple[Array, Ring]) -> tuple[Array, Ring]:
-            observation, ring = carry
-            action_key, elite_key, model_key, end_key = jax.random.split(jax.random.fold_in(key, t), 4)
+        def step(t: Array, carry: tuple[Array, Transition]) -> tuple[Array, Transition]:
+            observation, kept = carry
+            action_key, elite_key, model_key, end_key = jax.random.split(jax.random.fold_in(roll_key, t), 4)
             action, _ = state.soft.actor.sample(state.soft.normalizer(observation), key=action_key)
             # The rows are in no order, so that blocks of them for each elite are as good as an elite for each row.
             ensemble = state.world.ensemble.chosen(jax.random.permutation(elite_key, elites))
@@ -190,12 +194,15 @@ class MBPO:
             after, reward, terminal_reward, continues = (x.reshape(start.shape[0], *x.shape[2:]) for x in imagined)
             ends = ~self._rule(after) if self._rule else jax.random.uniform(end_key, continues.shape) > continues
             reward = jnp.where(ends, terminal_reward, reward)
-            ring = ring.add(Transition(observation, action, reward, after, ends.astype(jnp.float32)))
-            return jnp.where(ends[:, None], start, after), ring
+            new = Transition(observation, action, reward, after, ends.astype(jnp.float32))
+            now = wanted == t
+            kept = jax.tree.map(lambda n, k: jnp.where(now.reshape(-1, *[1] * (n.ndim - 1)), n, k), new, kept)
+            return jnp.where(ends[:, None], start, after), kept
 
-        _, ring = jax.lax.fori_loop(0, state.rollout_length, step, (start, state.imagined))
+        nothing = jax.tree.map(lambda x: jnp.zeros((start.shape[0], *x.shape[1:])), state.imagined.rows)
+        _, kept = jax.lax.fori_loop(0, state.rollout_length, step, (start, nothing))
         metrics = {"dynamics/rollout_length": state.rollout_length}
-        return eqx.tree_at(lambda x: x.imagined, state, ring), metrics
+        return eqx.tree_at(lambda x: x.imagined, state, state.imagined.add(kept)), metrics
 
     def improve(self, state: State, batch: Batch, *, key: PRNGKeyArray) -> tuple[State, Metrics]:
         """One update of SAC from real and imagined transitions."""

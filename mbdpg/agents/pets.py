@@ -26,7 +26,7 @@ class Config:
     horizon: int = 20
     """Steps of a plan."""
     particles: int = 1
-    """Imagined rollouts of each plan in each elite; their product is the authors' number of particles."""
+    """Imagined rollouts of each plan in each network; their product is the authors' number of particles."""
     population: int = 150
     """Plans drawn per iteration of the cross-entropy method."""
     plan_elites: int = 15
@@ -39,8 +39,6 @@ class Config:
     """How imagined episodes end: as the ensemble has learned, or by the simulator's own rule, known for some tasks."""
     members: int = 5
     """Networks of the ensemble."""
-    elites: int = 5
-    """Those with the least held-out error, which alone are planned with."""
     model_width: int = 128
     """Width of each of their four hidden layers."""
     model_learning_rate: float = 1e-3
@@ -64,16 +62,14 @@ class Config:
 
     def __post_init__(self) -> None:
         planned = ("horizon", "particles", "population", "plan_elites", "iterations")
-        fitted = ("members", "elites", "model_width", "model_learning_rate", "fit_batch_size")
+        fitted = ("members", "model_width", "model_learning_rate", "fit_batch_size")
         require_settings(
             self,
             positive=(*planned, *fitted),
             at_most={"discount": 1, "smoothing": 1, "exploration_scatter": 1, "exploration_color": 2},
         )
-        for few, many in (("elites", "members"), ("plan_elites", "population")):
-            number, bound = getattr(self, few), getattr(self, many)
-            flags = [f"--{name.replace('_', '-')}" for name in (few, many)]
-            require(number <= bound, f"{flags[0]} is {number}, expected at most as many as {flags[1]}, {bound}")
+        few = f"--plan-elites is {self.plan_elites}, expected at most as many as --population, {self.population}"
+        require(self.plan_elites <= self.population, few)
 
 
 class PETS:
@@ -88,12 +84,11 @@ class PETS:
         c = self.config = config
         self.env = env
         self._rule = known_rule(env) if c.termination == "known" else None
-        self._fitting = Fitting(c.members, c.model_width, c.model_learning_rate, c.weight_decay, c.fit_batch_size)
-        sampling, judging = self._fitting.sampling, self._fitting.judging
-        self.phases = (
-            Phase("fitting", c.fits_per_step, c.random_steps, sampling, first_updates=c.first_fits, update=self.fit),
-            Phase("judging", 0.004, c.random_steps, judging, first_updates=1, update=self.judge),
-        )
+        # All members plan, so no step is held out to choose among them.
+        rates = (c.model_learning_rate, c.weight_decay)
+        self._fitting = Fitting(c.members, c.model_width, *rates, c.fit_batch_size, judged=False)
+        sampling = self._fitting.sampling
+        self.phases = (Phase("fitting", c.fits_per_step, c.random_steps, sampling, c.first_fits, self.fit),)
 
     def init(self, *, key: PRNGKeyArray) -> World:
         """Fresh networks."""
@@ -104,15 +99,15 @@ class PETS:
         return eqx.tree_at(lambda x: x.units, state, Units.of(statistics))
 
     def policy(self, state: World) -> tuple[Planner, Normalizer]:
-        """To plan with the elites."""
+        """To plan."""
         c = self.config
         planner = Planner(
-            ensemble=state.ensemble.chosen(state.elites(c.elites)),
+            ensemble=state.ensemble,
             units=state.units,
             horizon=c.horizon,
             particles=c.particles,
             population=c.population,
-            elites=c.plan_elites,
+            plan_elites=c.plan_elites,
             iterations=c.iterations,
             smoothing=c.smoothing,
             discount=c.discount,
@@ -128,11 +123,6 @@ class PETS:
         """One update of the ensemble."""
         del key
         return self._fitting.fit(state, batch)
-
-    def judge(self, state: World, batch: Batch, *, key: PRNGKeyArray) -> tuple[World, Metrics]:
-        """Find out which members are the elites."""
-        del key
-        return self._fitting.judge(state, batch)
 
     @property
     def diagnosis(self) -> Sampling:

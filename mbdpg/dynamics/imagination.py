@@ -102,7 +102,7 @@ class Ring(NamedTuple):
     rows: Any
     """A pytree of arrays with a leading `slot` axis; zeros where nothing has been added yet."""
     added: Int[Array, ""]
-    """Rows ever added."""
+    """Rows added; once the ring is full, less by whole rounds, so that no run is long enough to overflow it."""
 
     @classmethod
     def empty(cls, slots: int, row: Any) -> Ring:
@@ -117,10 +117,12 @@ class Ring(NamedTuple):
         def write(old: Array, new: Array) -> Array:
             return jax.lax.dynamic_update_slice_in_dim(old, new, at, axis=0)
 
-        return Ring(jax.tree.map(write, self.rows, rows), self.added + batch)
+        added = self.added + batch
+        added = jnp.where(added >= 2 * slots, added - slots, added)
+        return Ring(jax.tree.map(write, self.rows, rows), added)
 
     def sample(self, batch: int, *, key: PRNGKeyArray) -> Any:
         """Rows drawn uniformly from those added; zeros while there are none."""
-        filled = jnp.minimum(self.added, jax.tree.leaves(self.rows)[0].shape[0]).astype(jnp.float32)
-        drawn = (jax.random.uniform(key, (batch,)) * filled).astype(jnp.int32)
+        filled = jnp.minimum(self.added, jax.tree.leaves(self.rows)[0].shape[0])
+        drawn = jax.random.randint(key, (batch,), 0, jnp.maximum(filled, 1))
         return jax.tree.map(lambda x: x[drawn], self.rows)

@@ -15,6 +15,9 @@ from mbdpg.dynamics.ensemble import Ensemble, Units, predict
 from mbdpg.dynamics.termination import RULES
 from mbdpg.networks.leaves import leaf_name
 
+MOST = 10**9
+"""A stranger's planner may not take more numbers than this for a layer, nor more rows of them for a plan."""
+
 
 def cross_entropy(
     score: Callable[[Float[Array, "plan time action"]], Float[Array, " plan"]],
@@ -63,7 +66,7 @@ class Planner(eqx.Module):
     particles: int = eqx.field(static=True)
     """Imagined rollouts of every plan and member; each stays with its member (TS-infinity)."""
     population: int = eqx.field(static=True)
-    elites: int = eqx.field(static=True)
+    plan_elites: int = eqx.field(static=True)
     iterations: int = eqx.field(static=True)
     smoothing: float = eqx.field(static=True)
     discount: float = eqx.field(static=True)
@@ -103,12 +106,13 @@ class Planner(eqx.Module):
         self, observation: Float[Array, " observation"], before: Float[Array, "time action"], *, key: PRNGKeyArray
     ) -> Float[Array, "time action"]:
         """The best sequence found from a raw observation, beginning from another."""
+        # The same imagined noise in every iteration: plans are then compared by what they are.
         noise_key, search_key = jax.random.split(key)
         return cross_entropy(
             lambda plans: self.imagined_return(observation, plans, key=noise_key),
             before,
             population=self.population,
-            elites=self.elites,
+            elites=self.plan_elites,
             iterations=self.iterations,
             smoothing=self.smoothing,
             key=search_key,
@@ -116,42 +120,53 @@ class Planner(eqx.Module):
 
 
 @eqx.filter_jit
-def _next(planner: Planner, observation: Array, before: Array, step: Array) -> tuple[Array, Array]:
-    """The action now, and what is left of the plan for the step after."""
-    plan = planner.plan(observation, before, key=jax.random.fold_in(jax.random.key(0), step))
-    return plan[0], jnp.concatenate([plan[1:], jnp.zeros_like(plan[:1])])
+def _plan(planner: Planner, observation: Array, before: Array, key: PRNGKeyArray, step: Array) -> Array:
+    return planner.plan(observation, before, key=jax.random.fold_in(key, step))
 
 
 class PlanningPolicy:
     """Plans anew at every step, beginning from what was planned one step before."""
 
-    def __init__(self, planner: Planner):
-        """Begin without a plan."""
+    def __init__(self, planner: Planner, *, key: PRNGKeyArray | None = None):
+        """Begin without a plan; the key decides what is drawn."""
         self.arrays = planner_arrays(planner)
         self.observation_size, self.action_size = planner.units.delta.shape[0], planner.action_size
-        self._planner = planner
+        self._planner = jax.tree.map(jnp.asarray, planner)
+        self._key = jax.random.key(0) if key is None else key
+        self._step = 0
         self.reset()
 
     def reset(self) -> None:
         """Forget the plan: a new episode begins."""
-        self._step = 0
-        self._plan: Array = jnp.zeros((self._planner.horizon, self.action_size))
+        self._rest = np.zeros((self._planner.horizon, self.action_size), np.float32)
+
+    @property
+    def memory(self) -> list[float]:
+        """The number of steps so far, and the rest of the plan."""
+        return [float(self._step), *self._rest.ravel().tolist()]
+
+    @memory.setter
+    def memory(self, values: list[float]) -> None:
+        self._step = int(values[0])
+        self._rest = np.asarray(values[1:], np.float32).reshape(self._planner.horizon, self.action_size)
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """The action, float32 in [-1, 1] of shape (action,), for a raw observation of shape (observation,)."""
-        seen = jnp.asarray(observation, jnp.float32)
+        seen = np.asarray(observation, np.float32)
         if seen.shape != (self.observation_size,):
             raise ValueError(f"the policy takes observations of shape ({self.observation_size},), not {seen.shape}")
-        action, self._plan = _next(self._planner, seen, self._plan, jnp.uint32(self._step))
+        now, before = jnp.asarray(seen), jnp.asarray(self._rest)
+        plan = np.asarray(_plan(self._planner, now, before, self._key, jnp.uint32(self._step)))
         self._step += 1
-        return np.asarray(action)
+        self._rest = np.concatenate([plan[1:], np.zeros_like(plan[:1])])
+        return plan[0]
 
     def explore(self, observation: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """The action with noise added to it."""
         return np.clip(self(observation) + noise, -1.0, 1.0).astype(np.float32)
 
 
-_NUMBERS = ("horizon", "particles", "population", "elites", "iterations", "smoothing", "discount")
+_NUMBERS = ("horizon", "particles", "population", "plan_elites", "iterations", "smoothing", "discount")
 _HIDDEN = "ensemble/members/hidden/"
 
 
@@ -183,10 +198,14 @@ def planner_of(arrays: Mapping[str, np.ndarray]) -> Planner:
         (size,) = arrays["units/delta"].shape
     except (KeyError, IndexError, ValueError) as error:
         raise ValueError(f"the planner is not whole ({error})") from error
-    whole = [numbers[name] for name in ("horizon", "particles", "population", "elites", "iterations")]
-    possible = all(isinstance(number, int) and 0 < number <= 10**6 for number in whole)
-    if not possible or numbers["elites"] > numbers["population"] or inputs <= size or rule not in (None, *RULES):
+    whole = [numbers[name] for name in _NUMBERS[:5]]
+    shares = [numbers["smoothing"], numbers["discount"]]
+    possible = all(type(x) is int and x > 0 for x in whole) and all(type(x) is float and 0 <= x <= 1 for x in shares)
+    if not possible or numbers["plan_elites"] > numbers["population"] or inputs <= size or rule not in (None, *RULES):
         raise ValueError(f"the planner has the impossible settings {numbers}, rule {rule!r}")
+    rows = count * numbers["particles"] * numbers["population"]
+    if rows * max(inputs, *widths) * layers > MOST or rows * numbers["horizon"] * numbers["iterations"] > MOST:
+        raise ValueError("the planner would think for too long")
 
     def fresh(key: PRNGKeyArray) -> Planner:
         ensemble = Ensemble(size, inputs - size, count=count, widths=widths, key=key)
@@ -197,6 +216,8 @@ def planner_of(arrays: Mapping[str, np.ndarray]) -> Planner:
         found = arrays.get(name)
         if found is None or (found.shape, found.dtype) != (leaf.shape, leaf.dtype) or not np.isfinite(found).all():
             raise ValueError(f"the planner's array {name} is not {leaf.dtype}{list(leaf.shape)} of finite numbers")
+        if name.startswith("units/") and not name.endswith("mean") and not (found > 0).all():
+            raise ValueError(f"the planner's array {name} is not positive")
         return jnp.asarray(found)
 
     return jax.tree_util.tree_map_with_path(take, jax.eval_shape(fresh, jax.random.key(0)))

@@ -47,8 +47,8 @@ def known_rule(env: EnvSpec) -> str:
     Raises:
         UserError: it is not known.
     """
-    name = env.id.split("-")[0]
-    if name not in RULES:
+    name, _, version = env.id.rpartition("-v")
+    if name not in RULES or not version.isdigit() or (int(version) < 4 and name != "Pendulum"):
         raise UserError(
             f"--termination is known, but nobody told us the rule of {env.id}; expected learned, or a task out of "
             + ", ".join(RULES)

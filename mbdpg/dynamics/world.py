@@ -12,7 +12,7 @@ import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from mbdpg.dynamics.ensemble import Ensemble, Units, ensemble_loss, held_out_error
-from mbdpg.interfaces import Batch, EnvSpec, Metrics, Sampling
+from mbdpg.interfaces import Batch, EnvSpec, Metrics, Part, Sampling
 
 
 class World(eqx.Module):
@@ -22,7 +22,7 @@ class World(eqx.Module):
     optimizer: Any
     units: Units
     errors: Float[Array, " member"]
-    """Each member's held-out error, a running average."""
+    """Each member's held-out error, a running average; NaN before the first."""
 
     def elites(self, count: int) -> Array:
         """The members with the least held-out error, the best first."""
@@ -40,15 +40,18 @@ class Fitting:
     weight_decay: float
     batch_size: int
     """Transitions per update and member."""
+    judged: bool
+    """Some steps are held out from learning, to judge the members by."""
 
     @property
     def sampling(self) -> Sampling:
         """Steps to learn from: a batch for every member, drawn apart."""
-        return Sampling(self.members * self.batch_size, burn_in=0, length=1, part="kept")
+        part: Part = "kept" if self.judged else "all"
+        return Sampling(self.members * self.batch_size, burn_in=0, length=1, part=part)
 
     @property
     def judging(self) -> Sampling:
-        """Steps to judge by, which none ever learns from."""
+        """Steps to judge by."""
         return Sampling(1024, burn_in=0, length=1, part="held-out")
 
     @property
@@ -59,7 +62,7 @@ class Fitting:
         """Fresh networks."""
         size, widths = env.observation_size, (self.width,) * 4
         ensemble = Ensemble(size, env.action_size, count=self.members, widths=widths, key=key)
-        return World(ensemble, self._optimizer.init(ensemble), Units.raw(size), jnp.zeros(self.members))
+        return World(ensemble, self._optimizer.init(ensemble), Units.raw(size), jnp.full(self.members, jnp.nan))
 
     def fit(self, world: World, batch: Batch) -> tuple[World, Metrics]:
         """One update of all members, each from steps of its own; `batch` is as `sampling` says."""
@@ -74,5 +77,5 @@ class Fitting:
     def judge(self, world: World, batch: Batch) -> tuple[World, Metrics]:
         """Measure every member; `batch` is as `judging` says."""
         now = held_out_error(world.ensemble, world.units, jax.tree.map(lambda x: x[:, 0], batch))
-        errors = jnp.where(world.errors > 0.0, 0.5 * (world.errors + now), now)
+        errors = jnp.where(jnp.isfinite(world.errors), 0.5 * (world.errors + now), now)
         return eqx.tree_at(lambda x: x.errors, world, errors), {"dynamics/held_out_mse": jnp.mean(now)}

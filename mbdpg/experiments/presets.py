@@ -65,13 +65,19 @@ TASKS: dict[str, dict[str, dict[str, dict[str, Any]]]] = {
             "LunarLanderContinuous-v3": {"trace": 1.0},  # 21: below 1 it hovers and never meets the ground
         },
     },
-    # What the authors set for the task: jannerm/mbpo, examples/config.
+    # What the authors set for the task (jannerm/mbpo, examples/config); both knew where the simulator ends episodes.
     "paper": {
+        "pets": {"HalfCheetah-v5": {"termination": "known"}},
         "mbpo": {
-            "Hopper-v5": {"final_rollout_length": 15, "entropy_per_action": -1 / 3},
-            "HalfCheetah-v5": {"updates_per_step": 40.0, "entropy_per_action": -0.5},
-            "Walker2d-v5": {"entropy_per_action": -0.5},
-            "Ant-v5": {"final_rollout_length": 25, "lengthen_until": 100_000, "entropy_per_action": -0.5},
+            "Hopper-v5": {"final_rollout_length": 15, "entropy_per_action": -1 / 3, "termination": "known"},
+            "HalfCheetah-v5": {"updates_per_step": 40.0, "entropy_per_action": -0.5, "termination": "known"},
+            "Walker2d-v5": {"entropy_per_action": -0.5, "termination": "known"},
+            "Ant-v5": {
+                "final_rollout_length": 25,
+                "lengthen_until": 100_000,
+                "entropy_per_action": -0.5,
+                "termination": "known",
+            },
         },
     },
 }

@@ -64,6 +64,7 @@ class NumpyPolicy:
 
     Attributes:
         arrays: the parameters by name, as in the files under a run's `policy/`.
+        memory: nothing; see `mbdpg.interfaces.Acting`.
     """
 
     def __init__(self, arrays: dict[str, np.ndarray]):
@@ -73,6 +74,7 @@ class NumpyPolicy:
             ValueError: a parameter is missing, misshapen or not finite.
         """
         self.arrays = {name: np.asarray(value, np.float32, order="C") for name, value in arrays.items()}
+        self.memory: list[float] = []
         layers = sum(name.startswith("hidden/") and name.endswith("/weight") for name in arrays)
         plain = not any(name.endswith(("/scale", "/offset")) for name in arrays)
         parts = ("weight", "bias") if plain else ("weight", "bias", "scale", "offset")

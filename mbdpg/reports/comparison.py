@@ -15,6 +15,9 @@ from mbdpg.reports.curves import learning_curve
 from mbdpg.reports.statistics import probability_of_improvement, summarize
 from mbdpg.storage.run_folder import RunFolder
 
+LOOKS_ON = {"steps", "evaluate_every", "evaluation_episodes", "log_every", "checkpoint_every"}
+"""Settings that change nothing of what is learned at a step."""
+
 
 def run_folders(paths: Sequence[Path]) -> list[Path]:
     """The run folders that these are, or that lie in them.
@@ -31,15 +34,16 @@ def run_folders(paths: Sequence[Path]) -> list[Path]:
 
 
 def grouped(runs: Sequence[Path]) -> dict[str, dict[str, list[Path]]]:
-    """Runs that differ by nothing but their seed: for each environment, folders by a label that tells groups apart."""
+    """Runs of the same settings: for each environment, folders by a label that tells groups apart."""
     groups: dict[str, dict[str, list[Path]]] = defaultdict(lambda: defaultdict(list))
     settings: dict[str, dict[str, Any]] = {}
     for run in runs:
         config = RunFolder.open(run).config
         flat = {"algorithm": config.get("algorithm"), "demonstrations": config.get("demonstrations")}
-        for part in ("agent", "env_options"):
+        for part in ("agent", "env_options", "schedule"):
             values = config.get(part)
             flat |= values if isinstance(values, dict) else {}
+        flat = {name: value for name, value in flat.items() if name not in LOOKS_ON}
         key = json.dumps(flat, sort_keys=True)
         settings[key] = flat
         groups[str(config.get("env"))][key].append(run)
@@ -81,8 +85,8 @@ def table(groups: dict[str, list[Path]], *, at: int | None = None) -> list[str]:
         spread = f" ± {found.std:,.1f}" if found.seeds > 1 else ""
         interval = f", {found.interquartile_mean:,.1f} [{found.low:,.1f}, {found.high:,.1f}]" if found.seeds > 1 else ""
         beaten = "" if label == best else f", {probability_of_improvement(scores[best], own):.0%}"
-        seeds = f"{found.seeds} seed{'s' * (found.seeds > 1)}"
-        lines.append(f"  {label} ({seeds}): {found.mean:,.1f}{spread}{interval}{beaten}")
+        count = f"{found.seeds} run{'s' * (found.seeds > 1)}"
+        lines.append(f"  {label} ({count}): {found.mean:,.1f}{spread}{interval}{beaten}")
     return lines
 
 

@@ -73,7 +73,7 @@ def read_array_file(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[
 
 
 def _digest(arrays: Mapping[str, np.ndarray], facts: Mapping[str, Any]) -> str:
-    """SHA-256 of everything in a file, in hexadecimal."""
+    """SHA-256 of arrays and facts, in hexadecimal."""
     digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])

@@ -66,6 +66,7 @@ class Collector:
         self._faults_in_a_row = 0
         self._return = 0.0
         self._observation: np.ndarray | None = None
+        self._memory: list[float] = []
 
     def collect(self, policy: Acting, std: float, steps: int) -> None:
         """Record `steps` environment steps, with uniformly random actions during the first `random_steps`.
@@ -76,6 +77,8 @@ class Collector:
             steps: environment steps to take.
         """
         until = self.env_steps + steps
+        if self._memory:
+            policy.memory = self._memory
         while self.env_steps < until:
             try:
                 if self._observation is None:
@@ -84,6 +87,7 @@ class Collector:
                 self._step(self._action(policy, std))
             except EnvironmentFailedError as error:
                 self._recover(error)
+        self._memory = policy.memory
         if self.baseline is None and self.env_steps >= self._random_steps and self.returns:
             self.baseline = float(np.mean(self.returns))
         if self.baseline is not None:
@@ -107,6 +111,7 @@ class Collector:
             "baseline": self.baseline,
             "faults_in_a_row": self._faults_in_a_row,
             "return": self._return,
+            "memory": self._memory,
         }
 
     def restore(self, facts: Mapping[str, Any]) -> None:
@@ -117,6 +122,7 @@ class Collector:
         self.env_steps, self.faults, self.episode = facts["env_steps"], facts["faults"], facts["episode"]
         self.returns, self.baseline = list(facts["returns"]), facts["baseline"]
         self._faults_in_a_row, self._return = facts["faults_in_a_row"], facts["return"]
+        self._memory = list(facts["memory"])
         observations, actions, after = self.replay.open_episode()
         if len(actions) == 0:
             return

@@ -16,6 +16,9 @@ from mbdpg.networks.leaves import leaf_name
 from mbdpg.networks.normalizer import Normalizer
 from mbdpg.networks.policy import GaussianPolicy, NumpyPolicy, Policy, policy_arrays
 
+EVALUATING, COLLECTING = 2**31, 2**31 + 1
+"""What keys are folded with for planning, far from the numbers of phases."""
+
 
 class Learner:
     """Holds the states of all seeds along a leading `seed` axis and runs k gradient steps per call."""
@@ -59,18 +62,19 @@ class Learner:
 
     def policies(self) -> list[Acting]:
         """Each seed's policy as learned."""
-        return self._on_host(*jax.vmap(self.agent.policy)(self.state))
+        return self._on_host(*jax.vmap(self.agent.policy)(self.state), role=EVALUATING)
 
     def behaviors(self) -> tuple[list[Acting], np.ndarray]:
         """Each seed's policy for collecting, and the standard deviations of the noise."""
         policy, normalizer, std = jax.vmap(self.agent.behavior)(self.state)
-        return self._on_host(policy, normalizer), np.asarray(std)
+        return self._on_host(policy, normalizer, role=COLLECTING), np.asarray(std)
 
-    def _on_host(self, policy: Policy | GaussianPolicy | Planner, normalizer: Normalizer) -> list[Acting]:
+    def _on_host(self, policy: Policy | GaussianPolicy | Planner, normalizer: Normalizer, *, role: int) -> list[Acting]:
         pairs = jax.device_get((policy, normalizer))
         each = [jax.tree.map(lambda x, i=i: x[i], pairs) for i in range(len(self._keys))]
         if isinstance(policy, Planner):
-            return [PlanningPolicy(planner) for planner, _ in each]
+            keys = jax.vmap(jax.random.fold_in, (0, None))(self._keys, role)
+            return [PlanningPolicy(planner, key=key) for (planner, _), key in zip(each, keys, strict=True)]
         return [NumpyPolicy(policy_arrays(*pair)) for pair in each]
 
     def snapshot(self, index: int) -> dict[str, np.ndarray]:

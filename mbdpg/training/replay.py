@@ -152,7 +152,7 @@ class Replay:
 
     def statistics(self, progress: float) -> Statistics:
         """Moments of all steps so far, as float32."""
-        return self._moments.statistics(progress)
+        return self._moments.statistics(progress)._replace(steps=np.float32(self.size - self.demonstrated))
 
 
 def _problem_with(columns: Mapping[str, np.ndarray]) -> str | None:

@@ -273,7 +273,7 @@ def test_nothing_is_imagined_after_the_end_of_an_episode(settings: tuple) -> Non
     elsewhere, other = update("improve", settings)(state(), edited(ended, next_observation=((0, -1), 3.0)))
     assert differences(after, elsewhere) <= {"imagined"}
     assert metrics["actor/objective"] == other["actor/objective"]
-    assert after.imagined.weight[0] == 0
+    assert after.imagined.rows.weight[0] == 0
     alive, _ = update("improve", settings)(state(), BATCHES["improve"])
     assert {"actor", "critics"} <= differences(after, alive)
 

@@ -109,70 +109,103 @@ def test_learning_steps_are_never_the_ones_that_judge() -> None:
 
 
 def test_errors_are_a_running_average_and_begin_with_the_first() -> None:
-    zero = eqx.tree_at(lambda x: x.world.errors, state(), jnp.zeros(3))
+    zero = eqx.tree_at(lambda x: x.world.errors, state(), jnp.full(3, jnp.nan))
     first = take("judging", zero)[0].world.errors
     assert (first > 0).all()
     second = take("judging", take("judging", zero)[0], seed=2)[0].world.errors
     np.testing.assert_allclose(second, 0.5 * (first + take("judging", zero, seed=2)[0].world.errors), rtol=1e-5)
 
 
-def imagined(length: int, env: EnvSpec = ENV, **settings: Any) -> tuple[Any, jax.Array]:
-    """What `length` steps of imagination add, step by step, and where it began."""
-    one, size = agent(env, **settings), 10
-    before = eqx.tree_at(lambda x: x.rollout_length, state(), jnp.int32(length))
+def imagined(length: int, before: State | None = None, env: EnvSpec = ENV, **settings: Any) -> tuple[Any, jax.Array]:
+    """The steps that rollouts of this length keep, and where they began."""
+    one = agent(env, **settings)
+    before = eqx.tree_at(lambda x: x.rollout_length, before or state(), jnp.int32(length))
+    size = one.phases[2].sampling.batch_size
+    before = eqx.tree_at(lambda x: x.imagined, before, one.init(key=jax.random.key(0)).imagined)
     after, _ = take("imagining", before, one)
-    assert int(after.imagined.added) == length * size
-    rows = jax.tree.map(lambda x: x[: length * size].reshape(length, size, *x.shape[1:]), after.imagined.rows)
-    return rows, batch(size).observation[:, 0]
+    assert int(after.imagined.added) == size
+    return jax.tree.map(lambda x: x[:size], after.imagined.rows), batch(size).observation[:, 0]
 
 
-def test_a_rollout_goes_on_where_it_was_and_begins_again_where_it_ended() -> None:
-    rows, start = imagined(4)
-    np.testing.assert_array_equal(rows.observation[0], start)
-    ends = rows.terminated == 1
-    assert 0 < ends.sum() < ends.size and set(np.unique(rows.terminated)) == {0.0, 1.0}
-    for t in range(3):
-        following = jnp.where(ends[t][:, None], start, rows.next_observation[t])
-        np.testing.assert_array_equal(rows.observation[t + 1], following)
-
-
-def test_a_rollout_is_the_actor_s_in_an_elite() -> None:
-    rows, start = imagined(1)
-    assert (jnp.abs(rows.action) < 1).all()
-    mean, _ = state().soft.actor.sample(state().soft.normalizer(start), key=jax.random.key(5))
-    assert not np.allclose(rows.action[0], mean)  # drawn, with a key of its own
-    everywhere = predict(
-        state().world.ensemble,
-        state().world.units,
-        jnp.broadcast_to(start, (3, 10, O)),
-        jnp.broadcast_to(rows.action[0], (3, 10, A)),
+@functools.cache
+def predictable() -> State:
+    """Gaussians so narrow that a step tells which member took it, a policy that hardly varies, and no ends."""
+    low = jnp.full((3, O + 1), -30.0)
+    bias = state().world.ensemble.members.output.bias.at[:, -1].set(100.0)
+    return eqx.tree_at(
+        lambda x: (
+            x.world.ensemble.members.max_log_variance,
+            x.world.ensemble.members.min_log_variance,
+            x.world.ensemble.members.output.bias,
+            x.soft.actor.spread.bias,
+        ),
+        state(),
+        (low, low, bias, jnp.full(A, -15.0)),
     )
-    # Narrow Gaussians tell which member it was.
-    narrow = eqx.tree_at(lambda x: x.world.ensemble.members.max_log_variance, state(), jnp.full((3, O + 1), -20.0))
-    narrow = eqx.tree_at(lambda x: x.world.ensemble.members.min_log_variance, narrow, jnp.full((3, O + 1), -20.0))
-    after = take("imagining", narrow)[0].imagined.rows.next_observation[:10]
-    distances = np.max(np.abs(np.asarray(everywhere.next_observation) - np.asarray(after)), axis=-1)
-    used = np.argmin(distances, axis=0)
-    assert (np.min(distances, axis=0) < 1e-3).all()
-    assert set(used[:5]) | set(used[5:]) == {1, 2} and len(set(used[:5])) == len(set(used[5:])) == 1
+
+
+def center(observation: jax.Array) -> jax.Array:
+    """What the policy does there."""
+    return state().soft.actor.center(state().soft.normalizer(observation))
+
+
+def every_member(observation: jax.Array) -> jax.Array:
+    """Where each member, following the policy, goes from there."""
+    size = observation.shape[0]
+    seen, action = (jnp.broadcast_to(x, (3, size, x.shape[1])) for x in (observation, center(observation)))
+    return predict(predictable().world.ensemble, state().world.units, seen, action).next_observation
+
+
+def nearest(paths: np.ndarray, found: jax.Array) -> int:
+    """Which member's path was taken."""
+    distances = np.abs(paths - np.asarray(found)).max(axis=1)
+    assert distances.min() < 1e-2
+    return int(np.argmin(distances))
+
+
+def test_a_rollout_follows_the_actor_in_an_elite_drawn_anew_at_every_step() -> None:
+    rows, start = imagined(2, predictable(), rollouts_per_step=40)
+    first = np.all(np.asarray(rows.observation) == np.asarray(start), axis=1)
+    assert 0.3 < first.mean() < 0.7  # of two steps one is kept, either as likely
+    np.testing.assert_allclose(rows.action, center(rows.observation), atol=1e-3)
+    begun, taken = np.asarray(every_member(start)), np.asarray(every_member(rows.observation))
+    seconds = [nearest(taken[:, row], rows.next_observation[row]) for row in range(len(first))]
+    firsts = [nearest(begun[:, row], rows.observation[row]) for row in np.flatnonzero(~first)]
+    assert set(seconds) == set(firsts) == {1, 2}  # the elites
+
+
+def test_actions_are_drawn() -> None:
+    rows, start = imagined(1)
+    assert (jnp.abs(rows.action) < 1).all() and np.abs(rows.action - center(start)).max() > 0.1
+
+
+def test_a_rollout_begins_again_where_it_ended() -> None:
+    ending = predictable().world.ensemble.members.output.bias.at[:, -1].set(-100.0)
+    before = eqx.tree_at(lambda x: x.world.ensemble.members.output.bias, predictable(), ending)
+    rows, start = imagined(3, before)
+    np.testing.assert_array_equal(rows.observation, start)
+    assert (rows.terminated == 1).all()
+
+
+def test_long_rollouts_leave_shallow_steps_as_often_as_deep_ones() -> None:
+    rows, start = imagined(8, predictable(), rollouts_per_step=200)
+    first = np.all(np.asarray(rows.observation) == np.asarray(start), axis=1)
+    assert 0.08 < first.mean() < 0.17
 
 
 def test_an_end_is_paid_by_its_own_head() -> None:
-    rows, _ = imagined(1)
-    everywhere = predict(
-        state().world.ensemble,
-        state().world.units,
-        jnp.broadcast_to(rows.observation[0], (3, 10, O)),
-        jnp.broadcast_to(rows.action[0], (3, 10, A)),
-    )
-    ended = np.flatnonzero(rows.terminated[0])
-    off = np.min(np.abs(np.asarray(everywhere.terminal_reward) - np.asarray(rows.reward[0])), axis=0)
-    assert len(ended) and (off[ended] < 1e-4).all()
-    assert (np.delete(off, ended) > 1e-4).all()
+    rows, _ = imagined(1, rollouts_per_step=8)
+    size = rows.reward.shape[0]
+    seen, action = (jnp.broadcast_to(x, (3, *x.shape)) for x in (rows.observation, rows.action))
+    everywhere = predict(state().world.ensemble, state().world.units, seen, action)
+    off = np.min(np.abs(np.asarray(everywhere.terminal_reward) - np.asarray(rows.reward)), axis=0)
+    ended = np.flatnonzero(rows.terminated)
+    assert 0 < len(ended) < size and set(np.unique(rows.terminated)) == {0.0, 1.0}
+    assert (off[ended] < 1e-4).all() and (np.delete(off, ended) > 1e-4).all()
 
 
 def test_a_known_rule_takes_the_place_of_the_learned_one() -> None:
-    rows, _ = imagined(2, ENV.__class__("Ant-v5", O, A, None, None), termination="known")
+    rows, _ = imagined(2, env=EnvSpec("Ant-v5", O, A, None, None), termination="known")
     height = rows.next_observation[..., 0]
     np.testing.assert_array_equal(rows.terminated == 0, (height >= 0.2) & (height <= 1.0))
     with pytest.raises(UserError, match="nobody told us the rule of made-in-code"):

@@ -14,20 +14,18 @@ ENV = EnvSpec("Ant-v5", observation_size=2, action_size=1, episode_limit=None, r
 
 
 def agent(**settings: float | str) -> PETS:
-    small = {"members": 3, "elites": 2, "model_width": 8, "fit_batch_size": 4, "population": 8, "plan_elites": 2}
+    small = {"members": 3, "model_width": 8, "fit_batch_size": 4, "population": 8, "plan_elites": 2}
     return PETS(Config(**(small | {"horizon": 3} | settings)), ENV)
 
 
-def test_it_plans_with_its_settings_and_its_best_members() -> None:
+def test_it_plans_with_its_settings_and_all_it_has_learned() -> None:
     one = agent(discount=0.9, smoothing=0.2, iterations=2, particles=3, termination="known")
     world = one.init(key=jax.random.key(0))
-    world = world.__class__(world.ensemble, world.optimizer, world.units, jnp.asarray([3.0, 1.0, 2.0]))
     planner, normalizer = one.policy(world)
-    assert (planner.horizon, planner.particles, planner.population, planner.elites) == (3, 3, 8, 2)
+    assert (planner.horizon, planner.particles, planner.population, planner.plan_elites) == (3, 3, 8, 2)
     assert (planner.iterations, planner.smoothing, planner.discount, planner.rule) == (2, 0.2, 0.9, "Ant")
     assert normalizer is world.units.normalizer
-    weights = world.ensemble.members.output.weight
-    np.testing.assert_array_equal(planner.ensemble.members.output.weight, weights[jnp.asarray([1, 2])])
+    assert planner.ensemble is world.ensemble
     again, _, std = agent(exploration_std=0.3).behavior(world)
     assert float(std) == np.float32(0.3) and again.rule is None
 
@@ -48,16 +46,16 @@ def test_instruments_are_of_the_model_alone() -> None:
 def test_it_brings_a_point_to_where_the_reward_is() -> None:
     """One step of a point that an action moves by a half, paid for its nearness to 0."""
     env = EnvSpec("point", observation_size=1, action_size=1, episode_limit=None, reference_return=None)
-    config = Config(members=2, elites=2, model_width=16, fit_batch_size=32, horizon=2, population=60, plan_elites=6)
+    config = Config(members=2, model_width=16, fit_batch_size=32, horizon=2, population=60, plan_elites=6)
     rng, replay, learner = np.random.default_rng(0), Replay(1, 1), Learner(PETS(config, env), [0])
     for step in range(600):
         place, action = rng.uniform(-1, 1, 1), rng.uniform(-1, 1, 1)
         after = place + 0.5 * action
         replay.add(*np.float32([place, action]), float(-abs(after[0])), np.float32(after), False, step % 5 == 4)
     learner.prepare([replay.statistics(0.0)])
-    fitting, judging = learner.agent.phases
-    for phase, updates in ((fitting, 600), (judging, 1)):
-        learner.update(phase, [replay.sample(updates, phase.sampling, rng)], 0)
+    (fitting,) = learner.agent.phases
+    assert fitting.sampling.part == "all"
+    learner.update(fitting, [replay.sample(600, fitting.sampling, rng)], 0)
     (policy,) = learner.policies()
     assert isinstance(policy, PlanningPolicy)
     for place in (-0.4, 0.0, 0.3):

@@ -35,7 +35,7 @@ AGENTS: dict[str, Agent] = {
     ),
     "pets": pets.PETS(
         pets.Config(
-            **{"members": 3, "elites": 2, "model_width": 16, "model_learning_rate": 3e-3, "fit_batch_size": BATCH},
+            **{"members": 3, "model_width": 16, "model_learning_rate": 3e-3, "fit_batch_size": BATCH},
             **{"discount": GAMMA, "horizon": 6, "population": 200, "plan_elites": 20, "iterations": 20},
         ),
         ENV,

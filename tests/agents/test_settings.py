@@ -48,7 +48,6 @@ IMPOSSIBLE = [
     (pets.Config, "horizon", 0),
     (pets.Config, "smoothing", 1.1),
     (pets.Config, "discount", 1.01),
-    (pets.Config, "elites", 6),
     (pets.Config, "plan_elites", 151),
     (mbpo.Config, "real_share", 1.5),
     (mbpo.Config, "elites", 8),

@@ -160,6 +160,10 @@ def test_a_full_ring_overwrites_its_oldest_rows_first() -> None:
         kept = {float(depth) for depth in full.rows.depth if depth}
         assert kept == set(map(float, range(max(1, value - 2), value + 1)))
     assert int(full.added) == 10
+    for value in range(6, 12):
+        full = full.add(batch_of(float(value)))
+        assert 6 <= int(full.added) < 12  # it never overflows
+    assert {float(depth) for depth in full.rows.depth} == {9, 10, 11}
     np.testing.assert_array_equal(full.rows.observation[:, 0], full.rows.depth)
     np.testing.assert_array_equal(full.rows.memory.cell[:, 0], full.rows.depth + 0.5)
 

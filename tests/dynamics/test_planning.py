@@ -26,7 +26,7 @@ def planner(rule: str | None = None, **settings: float) -> Planner:
     ensemble = jax.tree.map(lambda x: x + jnp.asarray(rng.normal(0, 0.2, x.shape), jnp.float32), ensemble)
     one = jnp.ones(())
     units = Units(Normalizer(jnp.asarray([0.5, -1.0]), jnp.asarray([2.0, 0.5])), jnp.asarray([0.2, 0.4]), one, 5 * one)
-    numbers = {"horizon": HORIZON, "particles": 2, "population": 20, "elites": 4, "iterations": 3}
+    numbers = {"horizon": HORIZON, "particles": 2, "population": 20, "plan_elites": 4, "iterations": 3}
     return Planner(
         ensemble=ensemble, units=units, rule=rule, **(numbers | {"smoothing": 0.1, "discount": 0.9} | settings)
     )
@@ -148,17 +148,52 @@ def test_what_runs_away_is_never_chosen() -> None:
     assert (mad.imagined_return(jnp.zeros(O), plans, key=jax.random.key(0)) == -jnp.inf).all()
 
 
-def test_a_policy_begins_from_its_last_plan_until_it_is_reset() -> None:
+def test_noise_of_the_model_is_imagined_and_its_mean_taken_over_particles() -> None:
+    wide = jnp.full((MEMBERS, O + 1), 2.0)
+    loud = eqx.tree_at(
+        lambda x: (x.ensemble.members.max_log_variance, x.ensemble.members.min_log_variance), planner(), (wide, wide)
+    )
+
+    def returns(particles: int) -> np.ndarray:
+        one = Planner(**(vars(loud) | {"particles": particles}))
+        keys = jax.random.split(jax.random.key(0), 300)
+        plans = jnp.zeros((1, HORIZON, A))
+        return np.asarray(jax.vmap(lambda k: one.imagined_return(jnp.zeros(O), plans, key=k)[0])(keys))
+
+    few, many = returns(1), returns(16)
+    assert few.std() > 0.3
+    assert many.std() == pytest.approx(few.std() / 4, rel=0.25)
+    assert many.mean() == pytest.approx(few.mean(), abs=4 * few.std() / np.sqrt(300))
+
+
+def test_a_policy_begins_from_the_rest_of_its_last_plan_until_it_is_reset() -> None:
+    one, key, observation = planner(), jax.random.key(3), np.float32([0.3, -0.7])
+    acting, before = PlanningPolicy(one, key=key), np.zeros((HORIZON, A), np.float32)
+    for step in range(4):
+        if step == 3:
+            acting.reset()
+            before = np.zeros((HORIZON, A), np.float32)
+        assert acting.memory == [step, *before.ravel().tolist()]
+        plan = one.plan(jnp.asarray(observation), jnp.asarray(before), key=jax.random.fold_in(key, step))
+        np.testing.assert_allclose(acting(observation), plan[0], atol=1e-6)
+        before = np.asarray(acting.memory[1:], np.float32).reshape(HORIZON, A)
+        np.testing.assert_allclose(before, [*plan[1:], *np.zeros((1, A))], atol=1e-6)
+
+
+def test_a_policy_goes_on_from_another_s_memory() -> None:
+    observation = np.float32([0.3, -0.7])
+    one, other = PlanningPolicy(planner()), PlanningPolicy(planner())
+    one(observation)
+    other.memory = one.memory
+    np.testing.assert_array_equal(one(observation), other(observation))
+    assert one.memory == other.memory and one.memory[0] == 2
+
+
+def test_actions_are_within_bounds_and_of_the_right_observation() -> None:
     acting, observation = PlanningPolicy(planner()), np.float32([0.3, -0.7])
-    first, second = acting(observation), acting(observation)
-    assert first.shape == (A,) and first.dtype == np.float32 and np.abs(first).max() <= 1
-    assert not np.array_equal(first, second)
-    acting.reset()
-    np.testing.assert_array_equal(acting(observation), first)
-    np.testing.assert_array_equal(acting(observation), second)
-    acting.reset()
-    noise = np.float32([5.0])
-    assert acting.explore(observation, noise) == 1.0
+    action = acting(observation)
+    assert action.shape == (A,) and action.dtype == np.float32 and np.abs(action).max() <= 1
+    assert acting.explore(observation, np.float32([5.0])) == 1.0
     with pytest.raises(ValueError, match=r"observations of shape \(2,\), not \(3,\)"):
         acting(np.zeros(3, np.float32))
 
@@ -177,9 +212,16 @@ def test_a_planner_comes_back_from_its_arrays(rule: str | None) -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"planner/horizon": np.asarray(10**9)}, "impossible settings"),
+        ({"planner/horizon": np.asarray(0)}, "impossible settings"),
+        ({"planner/horizon": np.asarray(True)}, "impossible settings"),
+        ({"planner/horizon": np.asarray(10**9)}, "too long"),
+        ({"planner/particles": np.asarray(10**9)}, "too long"),
+        ({"planner/smoothing": np.asarray(np.nan)}, "impossible settings"),
+        ({"planner/smoothing": np.asarray(0.1j)}, "impossible settings"),
+        ({"planner/discount": np.asarray(-1.0)}, "impossible settings"),
+        ({"units/normalizer/std": np.zeros(2, np.float32)}, "std is not positive"),
         ({"planner/horizon": np.asarray(2.5)}, "impossible settings"),
-        ({"planner/elites": np.asarray(21)}, "impossible settings"),
+        ({"planner/plan_elites": np.asarray(21)}, "impossible settings"),
         ({"planner/rule": np.frombuffer(b"Quake", np.uint8)}, "impossible settings"),
         ({"planner/horizon": np.zeros(2)}, "not whole"),
         ({"ensemble/members/hidden/0/weight": np.zeros((2, 3), np.float32)}, "not whole"),

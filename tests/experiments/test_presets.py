@@ -123,6 +123,34 @@ def test_the_rivals_have_their_authors_sizes_and_settings() -> None:
         assert {name: getattr(config, name) for name in expected} == expected
 
 
+def test_pets_has_its_authors_settings() -> None:
+    # Chua et al. 2018 and kchua/handful-of-trials, HalfCheetah.
+    expected = {"horizon": 30, "population": 500, "plan_elites": 50, "iterations": 5, "smoothing": 0.1, "members": 5}
+    expected |= {"model_width": 200, "model_learning_rate": 1e-3, "random_steps": 1000, "termination": "known"}
+    config = agent_config("pets", "paper", "HalfCheetah-v5")
+    assert {name: getattr(config, name) for name in expected} == expected
+    assert config.particles * config.members == 20
+
+
+@pytest.mark.parametrize(
+    ("env", "updates", "length", "until", "entropy"),
+    [
+        ("Hopper-v5", 20, 15, 150_000, -1),
+        ("HalfCheetah-v5", 40, 1, 150_000, -3),
+        ("Walker2d-v5", 20, 1, 150_000, -3),
+        ("Ant-v5", 20, 25, 100_000, -4),
+    ],
+)
+def test_mbpo_has_its_authors_settings_for_each_task(
+    env: str, updates: int, length: int, until: int, entropy: float
+) -> None:
+    # jannerm/mbpo, examples/config.
+    config, actions = agent_config("mbpo", "paper", env), gymnasium.make(env).action_space.shape
+    assert (config.updates_per_step, config.final_rollout_length, config.lengthen_until) == (updates, length, until)
+    assert actions is not None and config.entropy_per_action * actions[0] == pytest.approx(entropy)
+    assert config.termination == "known" and config.lengthen_from == 20_000
+
+
 @pytest.mark.parametrize("algorithm", CONFIGS)
 def test_a_preset_names_nothing_that_the_config_does_not_have(algorithm: str) -> None:
     assert PAPER[algorithm].keys() <= {field.name for field in dataclasses.fields(CONFIGS[algorithm])}

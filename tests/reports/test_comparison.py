@@ -48,9 +48,9 @@ def test_the_table_is_of_the_last_step_that_all_share(tmp_path: Path) -> None:
     bad = [make(tmp_path / "bad", {0: 0.0, 50: 10.5, 100: 20.5})]
     lines = table({"good": good, "bad": bad})
     assert lines[0].startswith("return at 100 steps: ") and lines[0].endswith("how often good is better")
-    assert lines[1] == "  good (2 seeds): 20.5 ± 0.7, 20.5 [20.0, 21.0]"
-    assert lines[2] == "  bad (1 seed): 20.5, 50%"
-    assert table({"good": good, "bad": bad}, at=50)[1].startswith("  good (2 seeds): 10.5")
+    assert lines[1] == "  good (2 runs): 20.5 ± 0.7, 20.5 [20.0, 21.0]"
+    assert lines[2] == "  bad (1 run): 20.5, 50%"
+    assert table({"good": good, "bad": bad}, at=50)[1].startswith("  good (2 runs): 10.5")
     with pytest.raises(UserError, match="--at is 150, expected a step at which all were evaluated: 0, 50, 100"):
         table({"good": good, "bad": bad}, at=150)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mbdpg.interfaces import UserError
-from mbdpg.storage.array_file import read_array_file, write_array_file
+from mbdpg.storage.array_file import _digest, read_array_file, write_array_file
 
 ARRAYS = {"b/weight": np.arange(6, dtype=np.float32).reshape(2, 3), "a": np.float32(2.5).reshape(())}
 FACTS = {"env_steps": 7, "return_mean": -1.25}
@@ -33,6 +33,13 @@ def test_a_flipped_bit_anywhere_in_the_numbers_or_facts_is_noticed(file: Path) -
         file.write_bytes(damaged)
         with pytest.raises(UserError, match="x.safetensors has other bytes than it was written with"):
             read_array_file(file, "policy")
+
+
+def test_arrays_that_changed_their_names_or_shapes_are_noticed() -> None:
+    whole, weight = _digest(ARRAYS, FACTS), ARRAYS["b/weight"]
+    for changed in (weight.reshape(3, 2), weight.view(np.int32)):
+        assert _digest(ARRAYS | {"b/weight": changed}, FACTS) != whole
+    assert _digest({"b/bias": weight, "a": ARRAYS["a"]}, FACTS) != whole
 
 
 def test_another_kind_of_file_is_named(file: Path) -> None:

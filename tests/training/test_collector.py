@@ -90,6 +90,7 @@ class Explorer:
 
     def __init__(self, of_observation: float = 1.0):
         self.arrays: dict[str, np.ndarray] = {}
+        self.memory: list[float] = []
         self.asked, self.resets = 0, 0
         self._share = of_observation
 

@@ -280,6 +280,14 @@ def test_kept_and_held_out_steps_are_apart_and_together_all() -> None:
     assert drawn["kept"] == drawn["all"] - drawn["held-out"] == set(range(23)) - {4, 9, 14, 19}
 
 
+def test_demonstrated_steps_are_not_counted_as_the_run_s() -> None:
+    replay = Replay(1, 1)
+    for row in range(5):
+        replay.add(np.float32([row]), np.float32([0]), 0.0, np.float32([row + 1]), False, False)
+    replay.demonstrated = 2
+    assert replay.statistics(0.0).steps == 3
+
+
 def test_a_replay_too_small_to_hold_steps_out_gives_one_that_it_has() -> None:
     replay = Replay(1, 1)
     replay.add(np.float32([0]), np.float32([0]), 7.0, np.float32([1]), False, False)
