@@ -1,11 +1,13 @@
 """Put run folders beside Stable-Baselines3's: python results/agreement.py PEERS.csv... RUN...
 
 Writes peers.csv beside this file, every evaluation of both programs, and prints for each task and algorithm whether the
-means at the last step that all seeds share differ by less than the pooled standard deviation over seeds.
+means at the end differ by less than the pooled standard deviation over seeds. A run is evaluated on episodes of its
+seed's own; its last policy is played in the peer's episodes too, and that is compared, so that no episode's luck is.
 """
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import sys
 from collections import defaultdict
@@ -13,8 +15,16 @@ from pathlib import Path
 
 import numpy as np
 
+from mbdpg.experiments.config import RunConfig
+from mbdpg.experiments.run import load_policy
 from mbdpg.storage.metrics import read_metrics
 from mbdpg.storage.run_folder import RunFolder
+from mbdpg.training.evaluation import evaluate
+
+EPISODES = range(10_000, 10_005)
+"""Environment seeds of the peer's evaluation, benchmarks/peers.py."""
+
+PAIRED = "mbdpg, in the peer's episodes"
 
 COLUMNS = ("program", "env", "algorithm", "seed", "env_steps", "return_mean", "return_std", "learning_seconds")
 
@@ -31,12 +41,21 @@ def rows_of_run(path: Path) -> list[dict[str, str]]:
     first = {"program": "mbdpg", "env": config["env"], "algorithm": config["algorithm"], "seed": str(config["seed"])}
     seconds = np.asarray(rows["time/seconds"]) - np.asarray(rows["time/evaluating"])
     columns = (rows["env_steps"], rows["eval/return_mean"], rows["eval/return_std"], seconds)
-    return [
+    own = [
         first
         | {"env_steps": str(steps), "return_mean": f"{mean:.1f}", "return_std": f"{std:.1f}"}
         | {"learning_seconds": str(round(spent))}
         for steps, mean, std, spent in zip(*columns, strict=True)
     ]
+    settings = RunConfig.from_json(config)
+    with contextlib.closing(settings.make_env()) as env:
+        returns = evaluate(env, load_policy(path), EPISODES).returns
+    paired = own[-1] | {
+        "program": PAIRED,
+        "return_mean": f"{np.mean(returns):.1f}",
+        "return_std": f"{np.std(returns):.1f}",
+    }
+    return [*own, paired]
 
 
 def main(paths: list[Path]) -> None:
@@ -46,22 +65,20 @@ def main(paths: list[Path]) -> None:
         writer = csv.DictWriter(file, COLUMNS)
         writer.writeheader()
         writer.writerows(rows)
-    found: dict[tuple[str, str], dict[str, dict[str, dict[int, float]]]] = defaultdict(lambda: defaultdict(dict))
+    last: dict[tuple[str, str], dict[str, dict[str, float]]] = defaultdict(lambda: defaultdict(dict))
     for row in rows:
-        curve = found[row["env"], row["algorithm"]][row["program"]].setdefault(row["seed"], {})
-        curve[int(row["env_steps"])] = float(row["return_mean"])
-    for (env, algorithm), programs in sorted(found.items()):
-        curves = [curve for seeds in programs.values() for curve in seeds.values()]
-        step = max(set.intersection(*map(set, curves)))
-        both = (programs[program].values() for program in ("mbdpg", "stable-baselines3"))
-        ours, peers = (np.array([curve[step] for curve in curves]) for curves in both)
+        if row["program"] != "mbdpg":
+            last[row["env"], row["algorithm"]][row["program"]][row["seed"]] = float(row["return_mean"])
+    for (env, algorithm), programs in sorted(last.items()):
+        both = (programs[program].values() for program in (PAIRED, "stable-baselines3"))
+        ours, peers = (np.array(list(returns)) for returns in both)
         if min(len(ours), len(peers)) < 2:
             continue
         pooled = np.sqrt((np.var(ours, ddof=1) + np.var(peers, ddof=1)) / 2)
         apart = abs(ours.mean() - peers.mean())
         verdict = "agree" if apart < pooled else "DIFFER"
-        print(f"{env} {algorithm} at {step:,}: apart {apart:.0f}, pooled std {pooled:.0f}: {verdict}")
-        for name, returns in (("mbdpg", ours), ("stable-baselines3", peers)):
+        print(f"{env} {algorithm}: apart {apart:.0f}, pooled std {pooled:.0f}: {verdict}")
+        for name, returns in ((PAIRED, ours), ("stable-baselines3", peers)):
             each = np.round(returns).astype(int).tolist()
             print(f"  {name}: {returns.mean():.0f} ± {returns.std(ddof=1):.0f}, {each}")
 
