@@ -274,11 +274,11 @@ def test_exact_critics_are_a_fixed_point(trace: float, imagination_ratio: float)
     after, metrics = improve(state, batch)
     assert float(metrics["critic/loss"]) < 1e-9
     if imagination_ratio > 0:  # now from the buffer's states too
-        assert (after.imagined.weight[:BATCH] == 1).all()
-        assert jnp.max(jnp.abs(after.imagined.observation)) < 7  # no bound is near
+        assert (after.imagined.rows.weight[:BATCH] == 1).all()
+        assert jnp.max(jnp.abs(after.imagined.rows.observation)) < 7  # no bound is near
         again = eqx.tree_at(lambda y: y.imagined, state, after.imagined)
         later, metrics = improve(again, batch)
         assert float(metrics["critic/loss"]) < 1e-9
-        assert (later.imagined.depth[BATCH : 2 * BATCH] > 3).any()  # imagination did go on from there
+        assert (later.imagined.rows.depth[BATCH : 2 * BATCH] > 3).any()  # imagination did go on from there
     wrong = batch._replace(reward=batch.reward + 0.1)
     assert float(improve(state, wrong)[1]["critic/loss"]) == pytest.approx(2 * 0.01, rel=1e-3)

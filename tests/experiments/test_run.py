@@ -99,7 +99,7 @@ EVERY_CASE = [("td3", "Pendulum-v1"), ("td3", LUNAR), ("mbdpg", "Pendulum-v1"), 
     [
         ("td3", LUNAR, [5]),
         ("sac", "Pendulum-v1", [4]),
-        ("mbpo", LUNAR, [5]),
+        pytest.param("mbpo", LUNAR, [5], marks=pytest.mark.slow),
         ("pets", "Pendulum-v1", [4]),
         ("mbdpg", "Pendulum-v1", [4]),
         *(pytest.param(*case, [0, 2, 4, 6, 8], marks=pytest.mark.slow) for case in EVERY_CASE),
