@@ -86,9 +86,10 @@ class Two(NamedTuple):
     metrics_alone: list[dict[str, np.ndarray]]
 
 
-@pytest.fixture(
-    scope="module", params=["toy", "td3", "sac", "pets", "mbpo", pytest.param("mbdpg", marks=pytest.mark.slow)]
-)
+LEARNERS = ["toy", "td3", "sac", "pets", *(pytest.param(name, marks=pytest.mark.slow) for name in ("mbpo", "mbdpg"))]
+
+
+@pytest.fixture(scope="module", params=LEARNERS)
 def two(request: pytest.FixtureRequest, toy: Any) -> Two:
     makers = {"td3": make_td3, "sac": make_sac, "pets": make_pets, "mbpo": make_mbpo, "mbdpg": make_mbdpg}
     make = (makers | {"toy": lambda: toy.ToyAgent(SPEC)})[request.param]
