@@ -401,6 +401,10 @@ def test_report_compares_runs_and_draws_them(say: Any, toys: None) -> None:
         say("report", "runs", "--at", "30"), "--at is 30, expected a step at which all were evaluated: 0, 20, 40"
     )
     check_refused(say("report"), "expected run folders")
+    Path("file").touch()
+    check_refused(say("report", "runs", "--out", "file"), "--out is file, which cannot be a folder: File exists")
+    Path("runs/0/seed-0/metrics.jsonl").write_text("")
+    check_refused(say("report", "runs"), "no evaluation at the same step")
 
 
 def test_a_run_that_ends_before_it_learns_says_so(say: Any, toys: None) -> None:
@@ -455,7 +459,9 @@ def test_too_little_memory_is_said_with_the_flags_that_lower_it(say: Any, monkey
 
     monkeypatch.setitem(VERBS, "train", fail)
     check_refused(
-        say("train", "Pendulum-v1"), "not enough memory", "lower --width, --memory, --batch-size or --horizon"
+        say("train", "Pendulum-v1"),
+        "not enough memory",
+        "lower the largest of its widths, batches, counts and horizons",
     )
 
 

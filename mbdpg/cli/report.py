@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from mbdpg.cli.flags import parse
-from mbdpg.interfaces import require
+from mbdpg.interfaces import UserError, require
 from mbdpg.reports.comparison import grouped, run_folders, table
 from mbdpg.reports.curves import draw_curves
 
@@ -32,10 +32,14 @@ def report(args: list[str]) -> None:
     """Run the verb."""
     flags = parse(Report, "report", args)
     require(len(flags.runs) > 0, "no run was given; expected run folders, or a folder that holds some")
+    if flags.out is not None:
+        try:
+            flags.out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UserError(f"--out is {flags.out}, which cannot be a folder: {error.strerror}") from error
     for env, groups in grouped(run_folders(flags.runs)).items():
         print(env, *table(groups, at=flags.at), sep="\n")
         if flags.out is not None:
-            flags.out.mkdir(parents=True, exist_ok=True)
             picture = flags.out / f"{env.replace('/', '-').replace(':', '-')}.png"
             draw_curves(groups, picture, title=env)
             print(f"  learning curves in {picture}")

@@ -78,7 +78,8 @@ def table(groups: dict[str, list[Path]], *, at: int | None = None) -> list[str]:
     require(step in shared, f"--at is {step}, expected a step at which all were evaluated: {_some(sorted(shared))}")
     scores = {label: [curve[step] for curve in own] for label, own in curves.items()}
     best = max(scores, key=lambda label: float(np.mean(scores[label])))
-    names = f"mean ± std, interquartile mean [95 % interval], and how often {best} is better"
+    names = "mean ± std, interquartile mean [95 % interval]"
+    names += f", and how often {best} is better" if len(scores) > 1 else ""
     lines = [f"return at {step:,} steps: {names}"]
     for label, own in scores.items():
         found = summarize(own)

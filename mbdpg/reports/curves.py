@@ -56,5 +56,6 @@ def draw_curves(groups: Mapping[str, Sequence[Path]], path: Path, *, title: str)
 def learning_curve(run: Path) -> dict[int, float]:
     """Mean return by environment steps, without evaluations in which every episode failed."""
     rows = read_metrics(run, "eval")
-    pairs = zip(rows["env_steps"], rows.get("eval/return_mean", []), strict=True)
+    absent = [None] * len(rows["env_steps"])  # of an evaluation of which only the timings were written
+    pairs = zip(rows["env_steps"], rows.get("eval/return_mean", absent), strict=True)
     return {step: value for step, value in pairs if value is not None}
