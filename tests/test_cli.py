@@ -461,7 +461,7 @@ def test_too_little_memory_is_said_with_the_flags_that_lower_it(say: Any, monkey
     check_refused(
         say("train", "Pendulum-v1"),
         "not enough memory",
-        "lower the largest of its widths, batches, counts and horizons",
+        "lower its largest width, batch, count or horizon",
     )
 
 

@@ -45,6 +45,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
             sys.exit(f"mbdpg: {one_line(str(error))}")
         if isinstance(error, MemoryError) or "Out of memory" in str(error):  # the latter XLA's
             sys.exit(
-                "mbdpg: this machine has not enough memory for it; lower the largest of its widths, batches, counts and horizons"
+                "mbdpg: this machine has not enough memory for it; lower its largest width, batch, count or horizon"
             )
         sys.exit(f"mbdpg: unexpected {type(error).__name__}: {one_line(str(error))}; --debug shows where")
