@@ -11,7 +11,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from mbdpg.agents import sac
-from mbdpg.dynamics.ensemble import DEPTHS, Units, open_loop_error, predict
+from mbdpg.dynamics.accuracy import DEPTHS
+from mbdpg.dynamics.ensemble import Units, open_loop_error, predict
 from mbdpg.dynamics.imagination import Ring
 from mbdpg.dynamics.termination import RULES, known_rule
 from mbdpg.dynamics.world import Fitting, World

@@ -9,7 +9,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, PRNGKeyArray
 
-from mbdpg.dynamics.ensemble import DEPTHS, Units, open_loop_error
+from mbdpg.dynamics.accuracy import DEPTHS
+from mbdpg.dynamics.ensemble import Units, open_loop_error
 from mbdpg.dynamics.planning import Planner
 from mbdpg.dynamics.termination import known_rule
 from mbdpg.dynamics.world import Fitting, World

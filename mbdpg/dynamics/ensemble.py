@@ -13,12 +13,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from mbdpg.dynamics.accuracy import DEPTHS, errors_at_depth
 from mbdpg.interfaces import Batch, Metrics, Statistics
 from mbdpg.networks.mlp import Linear
 from mbdpg.networks.normalizer import Normalizer, identity
-
-DEPTHS = (1, 5, 10, 20)
-"""Steps after which the open-loop error is looked at."""
 
 BOUNDS_WEIGHT = 0.01
 """Of the term that draws the learned bounds of the log variance together (Chua et al. 2018, Appendix A.1)."""
@@ -201,16 +199,13 @@ def predict(
 
 
 def open_loop_error(ensemble: Ensemble, units: Units, batch: Batch, *, depths: tuple[int, ...] = DEPTHS) -> Metrics:
-    """Root mean square error of the members' open-loop predictions, averaged, beside that of persistence.
+    """`mbdpg.dynamics.accuracy.errors_at_depth` of the members' open-loop predictions, averaged.
 
     Args:
         ensemble: the networks, each of which follows its own mean.
         units: theirs.
         batch: raw windows, shape (batch, time, ...), as long as the greatest depth.
         depths: steps after which to look.
-
-    Returns:
-        As `mbdpg.dynamics.fitting.open_loop_error`: in standard deviations of the observation.
     """
     windows = for_each(ensemble, batch)
     start = windows.observation[:, :, 0]
@@ -220,11 +215,5 @@ def open_loop_error(ensemble: Ensemble, units: Units, batch: Batch, *, depths: t
         return after, jnp.mean(after, axis=0)
 
     reached = jax.lax.scan(step, start, jnp.moveaxis(windows.action, 2, 0))[1]
-    metrics: Metrics = {}
-    for depth in depths:
-        exists, truth = batch.valid[:, depth - 1], units.normalizer(batch.next_observation[:, depth - 1])
-        count = jnp.sum(exists)  # 0 gives NaN: no window is that long
-        for name, guess in (("rmse", reached[depth - 1]), ("persistence", batch.observation[:, 0])):
-            square = jnp.mean(jnp.square(units.normalizer(guess) - truth), axis=-1)
-            metrics[f"dynamics/{name}_k{depth:02d}"] = jnp.sqrt(jnp.sum(square * exists) / count)
-    return metrics
+    reached, begun, truth = map(units.normalizer, (reached, batch.observation[:, 0], batch.next_observation))
+    return errors_at_depth(reached, begun, truth, batch.valid, depths)

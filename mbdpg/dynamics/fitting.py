@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from mbdpg.dynamics.accuracy import DEPTHS, errors_at_depth
 from mbdpg.dynamics.mixture import Memory, MixtureDynamics, Prediction, Scales, next_observation
 from mbdpg.interfaces import Metrics
 
@@ -139,22 +140,12 @@ def dynamics_loss(
 
 
 def open_loop_error(
-    dynamics: MixtureDynamics, scales: Scales, window: Window, *, burn_in: int, depths: tuple[int, ...]
+    dynamics: MixtureDynamics, scales: Scales, window: Window, *, burn_in: int, depths: tuple[int, ...] = DEPTHS
 ) -> Metrics:
-    """Root mean square error of open-loop prediction at each depth, beside that of persistence (no change at all).
-
-    In standard deviations of the observation, over steps whose whole past lies in the window.
-    """
+    """`mbdpg.dynamics.accuracy.errors_at_depth` of the mixture's mean, over steps whose past is in the window."""
     lead = slice(0, burn_in)
     memory = warm_memory(dynamics, window.observation[:, lead], window.action[:, lead], window.valid[:, lead])
     start = window.observation[:, burn_in]
     imagined = open_loop(dynamics, scales, start, memory, window.action[:, burn_in:])[1]
-    metrics: Metrics = {}
-    for depth in depths:
-        exists = window.valid[:, burn_in + depth - 1]
-        truth = window.next_observation[:, burn_in + depth - 1]
-        count = jnp.sum(exists)  # 0 gives NaN: no window is that long
-        for name, guess in (("rmse", imagined[depth]), ("persistence", start)):
-            square = jnp.mean(jnp.square(guess - truth), axis=-1)
-            metrics[f"dynamics/{name}_k{depth:02d}"] = jnp.sqrt(jnp.sum(square * exists) / count)
-    return metrics
+    truth, exists = window.next_observation[:, burn_in:], window.valid[:, burn_in:]
+    return errors_at_depth(imagined[1:], start, truth, exists, depths)

@@ -37,7 +37,7 @@ class Learner:
         self._keys = jax.vmap(jax.random.key)(jnp.asarray(seeds, jnp.uint32))
         init_keys = jax.vmap(jax.random.fold_in, (0, None))(self._keys, 0)
         self.state = jax.jit(over_seeds(lambda key: agent.init(key=key)))(init_keys)
-        self._prepare = jax.jit(over_seeds(agent.prepare))
+        self._prepare = jax.jit(over_seeds(agent.prepare), donate_argnums=0)
         self._diagnose = jax.jit(over_seeds(agent.diagnose))
         self._updates = {phase.name: _compile(phase) for phase in agent.phases}
 

@@ -96,19 +96,6 @@ MOVES = {
 MOVES["clone"] = MOVES["improve"]
 
 
-def differences(before: Any, after: Any) -> set[str]:
-    """Fields in which two states differ in any bit."""
-
-    def same(a: jax.Array, b: jax.Array) -> bool:
-        return np.asarray(a).tobytes() == np.asarray(b).tobytes()
-
-    return {
-        name
-        for name in vars(before)
-        if not all(jax.tree.leaves(jax.tree.map(same, getattr(before, name), getattr(after, name))))
-    }
-
-
 def finite(tree: Any) -> bool:
     return all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(tree))
 
@@ -122,13 +109,15 @@ def edited(original: Batch, **changes: tuple[Any, float]) -> Batch:
 
 
 @pytest.mark.parametrize("name", ["fit", "clone", "improve"])
-def test_an_update_moves_its_own_networks_and_nothing_else(name: str) -> None:
+def test_an_update_moves_its_own_networks_and_nothing_else(name: str, differences: Callable[..., set[str]]) -> None:
     after, metrics = update(name)(state(), BATCHES[name])
     assert differences(state(), after) == MOVES[name]
     assert finite(after) and finite(metrics)
 
 
-def test_the_papers_settings_move_the_same_and_fill_the_imagination_buffer() -> None:
+def test_the_papers_settings_move_the_same_and_fill_the_imagination_buffer(
+    differences: Callable[..., set[str]],
+) -> None:
     settings = tuple(PAPER.items())
     after, metrics = update("fit", settings)(state(), BATCHES["fit"])
     assert differences(state(), after) == MOVES["fit"]
@@ -181,7 +170,7 @@ def test_averages_reach_back_over_a_share_of_the_updates(name: str, share: float
         np.testing.assert_allclose(new, (1 - rate) * old + rate * followed, rtol=1e-5, atol=1e-6)
 
 
-def test_the_averages_are_evaluated_and_imagine_and_the_newest_learn() -> None:
+def test_the_averages_are_evaluated_and_imagine_and_the_newest_learn(differences: Callable[..., set[str]]) -> None:
     learned, normalizer = agent().policy(state())
     assert learned is state().average_actor and normalizer is state().normalizer
     windows, realized = jax.tree.map(jnp.asarray, batch(BURN_IN + 20)), jnp.zeros(BATCH)
@@ -212,7 +201,7 @@ def test_the_averages_are_evaluated_and_imagine_and_the_newest_learn() -> None:
     assert not along & moved("actor")
 
 
-def test_targets_wait_for_the_third_update_where_c_is_3() -> None:
+def test_targets_wait_for_the_third_update_where_c_is_3(differences: Callable[..., set[str]]) -> None:
     step = update("improve", tuple(PAPER.items()))
     states = [state()]
     for i in range(6):
@@ -248,7 +237,9 @@ def test_the_real_step_is_the_first_of_the_expansion(trace: float) -> None:
 
 @MODES
 @pytest.mark.parametrize("poison", [np.nan, np.inf])
-def test_a_batch_that_is_not_finite_moves_nothing_and_is_counted(settings: tuple, poison: float) -> None:
+def test_a_batch_that_is_not_finite_moves_nothing_and_is_counted(
+    settings: tuple, poison: float, differences: Callable[..., set[str]]
+) -> None:
     bad = edited(BATCHES["fit"], reward=((0, BURN_IN), poison))
     after, metrics = update("fit", settings)(state(), bad)
     assert differences(state(), after) == MOVES["fit"] - {"dynamics"}  # the average nears what is there already
@@ -266,7 +257,7 @@ def test_a_batch_that_is_not_finite_moves_nothing_and_is_counted(settings: tuple
 
 
 @MODES
-def test_nothing_is_imagined_after_the_end_of_an_episode(settings: tuple) -> None:
+def test_nothing_is_imagined_after_the_end_of_an_episode(settings: tuple, differences: Callable[..., set[str]]) -> None:
     """The state in which an episode ended: neither actor nor critics may learn from it or from what would follow."""
     ended = edited(BATCHES["improve"], terminated=((0, -1), 1))
     after, metrics = update("improve", settings)(state(), ended)
@@ -278,14 +269,14 @@ def test_nothing_is_imagined_after_the_end_of_an_episode(settings: tuple) -> Non
     assert {"actor", "critics"} <= differences(after, alive)
 
 
-def test_a_batch_of_ends_alone_leaves_the_actors_output_as_it_is() -> None:
+def test_a_batch_of_ends_alone_leaves_the_actors_output_as_it_is(differences: Callable[..., set[str]]) -> None:
     ended = edited(BATCHES["improve"], terminated=(slice(None), 1))
     after, metrics = update("improve")(state(), ended)
     assert metrics["actor/objective"] == 0
     assert "actor" not in differences(state(), after) and "critics" in differences(state(), after)
 
 
-def test_a_time_limit_is_not_an_end() -> None:
+def test_a_time_limit_is_not_an_end(differences: Callable[..., set[str]]) -> None:
     """The last step of a truncated episode bootstraps from its next observation, that of a terminated one does not."""
     differs = {}
     for kind in ("truncated", "terminated"):
@@ -346,7 +337,9 @@ def test_rewards_reach_the_critics_in_units_of_value_and_the_model_in_its_own() 
 
 
 @pytest.mark.parametrize("progress", [0.0, 0.25, 1.0])
-def test_beta_and_the_spread_of_exploration_follow_the_return(progress: float) -> None:
+def test_beta_and_the_spread_of_exploration_follow_the_return(
+    progress: float, differences: Callable[..., set[str]]
+) -> None:
     moving = MBDPG(Config(**NETWORKS, **SHAPES, beta=3.0, final_beta=1.0), ENV)
     prepared = jax.jit(moving.prepare)(state(), statistics(progress))
     assert float(prepared.beta) == pytest.approx(3 - 2 * progress)
@@ -371,7 +364,7 @@ def test_observation_entries_that_never_change_learn_finitely() -> None:
         assert finite(current) and finite(metrics)
 
 
-def test_the_same_key_gives_the_same_update_and_another_key_another() -> None:
+def test_the_same_key_gives_the_same_update_and_another_key_another(differences: Callable[..., set[str]]) -> None:
     step, given = update("improve"), BATCHES["improve"]
     once, again, other = (step(state(), given, i)[0] for i in (1, 1, 2))
     assert not differences(once, again)

@@ -62,24 +62,11 @@ def batch() -> Batch:
     return Batch(draw(O), np.tanh(draw(A)), draw(), draw(O), terminated, np.ones((BATCH, 1), np.float32))
 
 
-def differences(before: Any, after: Any) -> set[str]:
-    """Fields in which two states differ in any bit."""
-
-    def same(a: jax.Array, b: jax.Array) -> bool:
-        return np.asarray(a).tobytes() == np.asarray(b).tobytes()
-
-    return {
-        name
-        for name in vars(before)
-        if not all(jax.tree.leaves(jax.tree.map(same, getattr(before, name), getattr(after, name))))
-    }
-
-
 CRITIC = {"critics", "critic_optimizer", "updates"}
 ALL = CRITIC | {"actor", "actor_optimizer", "target_actor", "target_critics"}
 
 
-def test_the_actor_and_the_targets_move_at_every_second_update() -> None:
+def test_the_actor_and_the_targets_move_at_every_second_update(differences: Callable[..., set[str]]) -> None:
     states = [state()]
     for i in range(4):
         states.append(update(states[-1], batch(), seed=i)[0])
@@ -114,7 +101,9 @@ def test_the_critic_loss_is_numpys() -> None:
     assert float(metrics["critic/q_mean"]) == pytest.approx(2.0 * values.mean(), rel=1e-4)
 
 
-def test_what_follows_an_end_changes_nothing_and_what_follows_a_time_limit_does() -> None:
+def test_what_follows_an_end_changes_nothing_and_what_follows_a_time_limit_does(
+    differences: Callable[..., set[str]],
+) -> None:
     expected = update(state(), batch())[0]
     for row, matters in ((0, False), (1, True)):  # row 0 terminated; of a time limit the batch says nothing
         other = batch()
@@ -122,7 +111,7 @@ def test_what_follows_an_end_changes_nothing_and_what_follows_a_time_limit_does(
         assert ("critics" in differences(expected, update(state(), other)[0])) == matters
 
 
-def test_the_noise_on_target_actions_is_bounded() -> None:
+def test_the_noise_on_target_actions_is_bounded(differences: Callable[..., set[str]]) -> None:
     bounded = (("target_noise", 100.0), ("target_noise_clip", 0.0))
     quiet, _ = update(state(), batch(), settings=NOISELESS)
     assert not differences(quiet, update(state(), batch(), settings=bounded)[0])
@@ -139,7 +128,9 @@ def test_the_actor_climbs_the_first_critic() -> None:
 
 
 @pytest.mark.parametrize("poison", [np.nan, np.inf])
-def test_a_batch_that_is_not_finite_moves_nothing_and_is_counted(poison: float) -> None:
+def test_a_batch_that_is_not_finite_moves_nothing_and_is_counted(
+    poison: float, differences: Callable[..., set[str]]
+) -> None:
     bad, current = batch(), state()
     bad.reward[1] = poison
     bad.observation[2] = np.nan

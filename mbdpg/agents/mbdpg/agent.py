@@ -14,6 +14,7 @@ from mbdpg.agents import objectives
 from mbdpg.agents.mbdpg import instruments
 from mbdpg.agents.mbdpg.config import Config
 from mbdpg.agents.mbdpg.state import State, initial_state, optimizers
+from mbdpg.dynamics.accuracy import DEPTHS
 from mbdpg.dynamics.fitting import Window, dynamics_loss, warm_memory
 from mbdpg.dynamics.imagination import Ring, Start, Trajectory, imagine
 from mbdpg.dynamics.mixture import Scales
@@ -281,7 +282,7 @@ class MBDPG:
     @property
     def diagnosis(self) -> Sampling:
         """Windows long enough for the deepest open-loop error."""
-        return Sampling(256, self.config.burn_in, max(instruments.DEPTHS))
+        return Sampling(256, self.config.burn_in, max(DEPTHS))
 
     def diagnose(self, state: State, batch: Batch, realized_return: Array) -> Metrics:
         """Open-loop error, Q and survival against what happened, gradient norm per imagined depth."""

@@ -10,14 +10,12 @@ from jaxtyping import Array, Float
 from mbdpg.agents import objectives
 from mbdpg.agents.mbdpg.config import Config
 from mbdpg.agents.mbdpg.state import State
+from mbdpg.dynamics.accuracy import DEPTHS
 from mbdpg.dynamics.fitting import Window, open_loop_error, warm_memory
 from mbdpg.dynamics.imagination import Trajectory, imagine
 from mbdpg.dynamics.mixture import Memory
 from mbdpg.interfaces import Metrics
 from mbdpg.networks.policy import Policy
-
-DEPTHS = (1, 5, 10, 20)
-"""Imagined steps after which the instruments look."""
 
 NEAR = 5
 """Imagined steps whose rewards are compared with those that were paid."""
@@ -48,7 +46,7 @@ def measure(config: Config, state: State, window: Window, realized_return: Float
     excess = jnp.sum((imagined.rewards[:NEAR].T - paid) * exists) / jnp.sum(exists)
     ended = jnp.max(window.terminated[:, config.burn_in :] * window.valid[:, config.burn_in :], axis=1)
     return (
-        open_loop_error(state.average_dynamics, state.scales, window, burn_in=config.burn_in, depths=DEPTHS)
+        open_loop_error(state.average_dynamics, state.scales, window, burn_in=config.burn_in)
         | objectives.value_bias(value, realized_return)
         | {
             "dynamics/reward_bias": excess * state.return_scale,
