@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -17,9 +17,10 @@ import numpy as np
 import pytest
 
 import mbdpg
-from mbdpg.cli import compilations, main
+from mbdpg.cli import main
 from mbdpg.cli.verbs import VERBS
 from mbdpg.experiments import expert
+from mbdpg.experiments.launch import Local
 from mbdpg.storage import RunFolder
 
 Start = Callable[..., "subprocess.Popen[str]"]
@@ -206,6 +207,8 @@ def test_train_s_help_shows_the_flags_of_the_algorithm_and_the_values_of_the_pre
         (("resume",), "run"),
         (("evaluate", "run", "--episodes", "1.5"), "--episodes"),
         (("demonstrate", "Pendulum-v1"), "--out"),
+        (("reproduce", "figure-10"), "figure-10"),
+        (("reproduce", "figure-4", "--scale", "huge"), "--scale"),
     ],
     ids=str,
 )
@@ -330,6 +333,36 @@ def test_an_evaluation_that_cannot_be_is_refused(say: Any, trained: Path, flags:
 def test_demonstrations_that_cannot_be_are_refused_before_an_expert_is_trained(say: Any, flags: Any, said: str) -> None:
     check_refused(say("demonstrate", *flags, "--out", "new/good.safetensors"), said)
     assert list(Path.cwd().iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (("figure-6", "--workers", "0"), "--workers is 0, expected at least 1"),
+        (("figure-6", "--seeds", "-1"), "--seeds are (-1,), expected from 0 to 2^31 - 1"),
+        (("figure-6", "--seeds", "1", "1"), "--seeds are (1, 1), expected different ones"),
+        (("figure-6", "--address", "127.0.0.1:6379"), "--address, --gpus need --engine ray"),
+        (("figure-6", "--out", "file"), "file cannot be a folder of studies"),
+    ],
+    ids=str,
+)
+def test_a_study_that_cannot_be_is_refused(say: Any, flags: Any, said: str) -> None:
+    Path("file").write_text("")
+    check_refused(say("reproduce", *flags), said)
+    assert [path.name for path in Path.cwd().iterdir()] == ["file"]
+
+
+def test_a_study_that_is_stopped_says_how_to_go_on(say: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[Any] = []
+
+    def stopped(*arguments: Any, should_stop: Any, **others: Any) -> None:
+        given.extend(arguments)
+        should_stop.signal = 15
+
+    monkeypatch.setattr("mbdpg.cli.reproduce.reproduce_study", stopped)
+    said = say("reproduce", "figure-8", "--scale", "smoke", "--seeds", "3")
+    assert said == Said(143, "", "mbdpg: saved; go on with: mbdpg reproduce figure-8 --scale smoke --seeds 3\n")
+    assert given == ["figure-8", "smoke", Path.cwd() / "studies" / "smoke", Local(os.cpu_count() or 1)]
 
 
 def test_an_expert_of_another_environment_is_refused(say: Any, trained: Path) -> None:
@@ -471,57 +504,3 @@ def test_ctrl_c_where_there_is_nothing_to_save_is_no_traceback(say: Any, monkeyp
 
     monkeypatch.setitem(VERBS, "evaluate", interrupted)
     assert say("evaluate", "run") == Said(130, "", "")
-
-
-# Compiled programs.
-
-
-class JaxConfig(dict):
-    """What JAX is told."""
-
-    jax_compilation_cache_dir: str | None = None
-    update = dict.__setitem__  # type: ignore[assignment]  # as of a setting, not of a mapping
-
-
-@pytest.fixture
-def jax_config(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> JaxConfig:
-    config = JaxConfig()
-    monkeypatch.setattr(compilations, "jax", SimpleNamespace(config=config))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    return config
-
-
-def test_compiled_programs_are_kept_where_nobody_else_writes(
-    jax_config: JaxConfig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    compilations.keep_compilations()
-    first = Path(jax_config["jax_compilation_cache_dir"])
-    assert first.parent == tmp_path / "mbdpg" and first.stat().st_mode & 0o777 == 0o700
-    compilations.keep_compilations()
-    assert Path(jax_config["jax_compilation_cache_dir"]) == first
-    monkeypatch.setattr(compilations, "describe_machine", lambda: {"cpu": "another"})
-    compilations.keep_compilations()
-    assert Path(jax_config["jax_compilation_cache_dir"]) != first
-
-
-def test_compiled_programs_stay_where_jax_was_told_to_keep_them(jax_config: JaxConfig, tmp_path: Path) -> None:
-    jax_config.jax_compilation_cache_dir = "elsewhere"
-    compilations.keep_compilations()
-    assert not jax_config and not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("obstacle", ["file", "link"])
-def test_without_a_folder_of_ones_own_everything_is_compiled_anew(
-    jax_config: JaxConfig, tmp_path: Path, obstacle: str
-) -> None:
-    compilations.keep_compilations()
-    folder = Path(jax_config.pop("jax_compilation_cache_dir"))
-    jax_config.clear()
-    folder.rmdir()
-    if obstacle == "file":
-        folder.write_text("")
-    else:
-        (tmp_path / "theirs").mkdir()
-        folder.symlink_to(tmp_path / "theirs")
-    compilations.keep_compilations()
-    assert not jax_config

@@ -126,6 +126,7 @@ PROJECT = PYPROJECT["project"]
 DEPENDENCIES = [
     *((line, "requirements.txt") for line in PROJECT["dependencies"]),
     *((line, "requirements-dev.txt") for line in PROJECT["optional-dependencies"]["dev"]),
+    *((line, "requirements-extras.txt") for line in PROJECT["optional-dependencies"]["ray"]),
 ]
 
 
@@ -137,7 +138,8 @@ def test_each_dependency_is_pinned_within_its_range_and_explained(line: str, fil
 
 
 def test_what_the_package_imports_is_declared() -> None:
-    declared = {canonicalize_name(Requirement(line).name) for line in PROJECT["dependencies"]} | BROUGHT_BY_AN_EXTRA
+    lines = [*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["ray"]]
+    declared = {canonicalize_name(Requirement(line).name) for line in lines} | BROUGHT_BY_AN_EXTRA
     imported = {module for path in PACKAGE for module in imported_modules(in_package(path))}
     distributions = importlib.metadata.packages_distributions()
     undeclared = {

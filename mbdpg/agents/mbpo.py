@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from mbdpg.agents import sac
-from mbdpg.dynamics.accuracy import DEPTHS
+from mbdpg.dynamics.accuracy import DEPTHS, error_metrics
 from mbdpg.dynamics.ensemble import Units, open_loop_error, predict
 from mbdpg.dynamics.imagination import Ring
 from mbdpg.dynamics.termination import RULES, known_rule
@@ -221,5 +221,5 @@ class MBPO:
 
     def diagnose(self, state: State, batch: Batch, realized_return: Array) -> Metrics:
         """SAC's instruments, and the ensemble's open-loop error."""
-        errors = open_loop_error(state.world.ensemble, state.world.units, batch)
+        errors = error_metrics(open_loop_error(state.world.ensemble, state.world.units, batch))
         return self._sac.diagnose(state.soft, batch, realized_return) | errors

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, PRNGKeyArray
 
-from mbdpg.dynamics.accuracy import DEPTHS
+from mbdpg.dynamics.accuracy import DEPTHS, error_metrics
 from mbdpg.dynamics.ensemble import Units, open_loop_error
 from mbdpg.dynamics.planning import Planner
 from mbdpg.dynamics.termination import known_rule
@@ -133,4 +133,4 @@ class PETS:
     def diagnose(self, state: World, batch: Batch, realized_return: Array) -> Metrics:
         """The ensemble's open-loop error; there is no value to compare with returns."""
         del realized_return
-        return open_loop_error(state.ensemble, state.units, batch)
+        return error_metrics(open_loop_error(state.ensemble, state.units, batch))

@@ -17,13 +17,14 @@ import numpy as np
 import tyro
 
 from mbdpg import envs
-from mbdpg.cli.compilations import keep_compilations
 from mbdpg.cli.flags import parse, peek, program
 from mbdpg.cli.report import report
-from mbdpg.cli.stopping import Stop
+from mbdpg.cli.reproduce import reproduce
 from mbdpg.experiments import benchmark, expert, presets
+from mbdpg.experiments.compilations import keep_compilations
 from mbdpg.experiments.config import AgentConfig, EnvOptions, RunConfig
 from mbdpg.experiments.run import load_policy, resume, train
+from mbdpg.experiments.stopping import Stop
 from mbdpg.interfaces import require
 from mbdpg.reports.console import RunDisplay
 from mbdpg.reports.curves import draw_curves
@@ -287,6 +288,7 @@ VERBS = {
     "resume": _resume,
     "evaluate": _evaluate,
     "demonstrate": _demonstrate,
+    "reproduce": reproduce,
     "report": report,
     "benchmark": _benchmark,
 }

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from mbdpg.dynamics.accuracy import DEPTHS, errors_at_depth
+from mbdpg.dynamics.accuracy import errors_over_time
 from mbdpg.interfaces import Batch, Metrics, Statistics
 from mbdpg.networks.mlp import Linear
 from mbdpg.networks.normalizer import Normalizer, identity
@@ -198,14 +198,13 @@ def predict(
     )
 
 
-def open_loop_error(ensemble: Ensemble, units: Units, batch: Batch, *, depths: tuple[int, ...] = DEPTHS) -> Metrics:
-    """`mbdpg.dynamics.accuracy.errors_at_depth` of the members' open-loop predictions, averaged.
+def open_loop_error(ensemble: Ensemble, units: Units, batch: Batch) -> Float[Array, "time 2"]:
+    """`mbdpg.dynamics.accuracy.errors_over_time` of the members' open-loop predictions, averaged.
 
     Args:
         ensemble: the networks, each of which follows its own mean.
         units: theirs.
-        batch: raw windows, shape (batch, time, ...), as long as the greatest depth.
-        depths: steps after which to look.
+        batch: raw windows, shape (batch, time, ...).
     """
     windows = for_each(ensemble, batch)
     start = windows.observation[:, :, 0]
@@ -216,4 +215,4 @@ def open_loop_error(ensemble: Ensemble, units: Units, batch: Batch, *, depths: t
 
     reached = jax.lax.scan(step, start, jnp.moveaxis(windows.action, 2, 0))[1]
     reached, begun, truth = map(units.normalizer, (reached, batch.observation[:, 0], batch.next_observation))
-    return errors_at_depth(reached, begun, truth, batch.valid, depths)
+    return errors_over_time(reached, begun, truth, batch.valid)

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mbdpg.dynamics.accuracy import DEPTHS, errors_at_depth
-from mbdpg.dynamics.mixture import Memory, MixtureDynamics, Prediction, Scales, next_observation
+from mbdpg.dynamics.accuracy import errors_over_time
+from mbdpg.dynamics.mixture import Dynamics, Memory, Prediction, Scales, next_observation
 from mbdpg.interfaces import Metrics
 
 Likelihood = Literal["mixture", "eq11"]
@@ -28,7 +28,7 @@ class Window(NamedTuple):
 
 
 def warm_memory(
-    dynamics: MixtureDynamics,
+    dynamics: Dynamics,
     observations: Float[Array, "batch time observation"],
     actions: Float[Array, "batch time action"],
     valid: Float[Array, "batch time"],
@@ -45,7 +45,7 @@ def warm_memory(
 
 
 def open_loop(
-    dynamics: MixtureDynamics,
+    dynamics: Dynamics,
     scales: Scales,
     start: Float[Array, "batch observation"],
     memory: Memory,
@@ -89,7 +89,7 @@ def mixture_nll(
 
 
 def dynamics_loss(
-    dynamics: MixtureDynamics,
+    dynamics: Dynamics,
     scales: Scales,
     window: Window,
     *,
@@ -139,13 +139,11 @@ def dynamics_loss(
     }
 
 
-def open_loop_error(
-    dynamics: MixtureDynamics, scales: Scales, window: Window, *, burn_in: int, depths: tuple[int, ...] = DEPTHS
-) -> Metrics:
-    """`mbdpg.dynamics.accuracy.errors_at_depth` of the mixture's mean, over steps whose past is in the window."""
+def open_loop_error(dynamics: Dynamics, scales: Scales, window: Window, *, burn_in: int) -> Float[Array, "time 2"]:
+    """`mbdpg.dynamics.accuracy.errors_over_time` of the mixture's mean, over steps whose past is in the window."""
     lead = slice(0, burn_in)
     memory = warm_memory(dynamics, window.observation[:, lead], window.action[:, lead], window.valid[:, lead])
     start = window.observation[:, burn_in]
     imagined = open_loop(dynamics, scales, start, memory, window.action[:, burn_in:])[1]
     truth, exists = window.next_observation[:, burn_in:], window.valid[:, burn_in:]
-    return errors_at_depth(imagined[1:], start, truth, exists, depths)
+    return errors_over_time(imagined[1:], start, truth, exists)

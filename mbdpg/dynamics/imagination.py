@@ -30,7 +30,8 @@ class Trajectory(NamedTuple):
 
     def survival(self) -> Float[Array, "state *batch"]:
         """Probability of still being alive at each state: 1 at the first, then the product of `continues`."""
-        return jnp.concatenate([jnp.ones_like(self.continues[:1]), jnp.cumprod(self.continues, axis=0)])
+        alive = jnp.ones((1, *self.continues.shape[1:]))
+        return jnp.concatenate([alive, jnp.cumprod(self.continues, axis=0)])
 
 
 def imagine(
@@ -74,7 +75,7 @@ def imagine(
         return (after, memory), (observation, action, reward, alive)
 
     (last, memory), (observations, actions, rewards, continues) = jax.lax.scan(
-        step, (start, memory), jnp.arange(horizon), unroll=min(horizon, UNROLLED)
+        step, (start, memory), jnp.arange(horizon), unroll=max(min(horizon, UNROLLED), 1)
     )
     return Trajectory(
         observations=jnp.concatenate([observations, last[None]]),

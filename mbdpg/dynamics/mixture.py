@@ -6,7 +6,7 @@ theirs, rewards by their standard deviation (`Scales` holds the factors that con
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -67,6 +67,19 @@ class Outcome(NamedTuple):
     """Of a step that does."""
     continue_logit: Float[Array, "*batch"]
     """Log odds that the episode goes on."""
+
+
+@runtime_checkable
+class Dynamics(Protocol):
+    """What is trained over several steps and predicts open loop; the methods are described at `MixtureDynamics`."""
+
+    def initial_memory(self, batch: tuple[int, ...]) -> Memory: ...
+
+    def remember(self, memory: Memory, observation: Array, action: Array) -> Memory: ...
+
+    def predict(self, memory: Memory, observation: Array, action: Array) -> Prediction: ...
+
+    def outcome(self, memory: Memory, observation: Array, action: Array, delta: Array) -> Outcome: ...
 
 
 class MixtureDynamics(eqx.Module):

@@ -37,7 +37,7 @@ MODES = pytest.mark.parametrize("settings", [(), tuple(PAPER.items())], ids=["de
 
 
 def agent(settings: tuple = ()) -> MBDPG:
-    return MBDPG(Config(**NETWORKS, **SHAPES, **dict(settings)), ENV)
+    return MBDPG(Config(**(NETWORKS | SHAPES | dict(settings))), ENV)
 
 
 @functools.cache
@@ -201,6 +201,39 @@ def test_the_averages_are_evaluated_and_imagine_and_the_newest_learn(differences
     assert not along & moved("actor")
 
 
+def test_without_a_horizon_nothing_depends_on_the_model(differences: Callable[..., set[str]]) -> None:
+    settings = (("horizon", 0),)
+    assert [phase.name for phase in agent(settings).phases] == ["cloning", "improving"]
+    elsewhere = eqx.tree_at(
+        lambda x: x.average_dynamics, state(), jax.tree.map(lambda x: x + 1.0, state().average_dynamics)
+    )
+    once, other = (update("improve", settings)(before, BATCHES["improve"])[0] for before in (state(), elsewhere))
+    assert differences(once, other) == {"average_dynamics"}
+    assert differences(state(), once) == MOVES["improve"]
+
+
+def test_without_a_horizon_the_critics_target_is_td3s() -> None:
+    """Eq. 14, with the value of the target actor's smoothed action."""
+    one, key = agent((("horizon", 0), ("target_noise", 0.0))), jax.random.key(0)
+    window = one.normalized(state(), jax.tree.map(jnp.asarray, edited(BATCHES["improve"], terminated=((0, -1), 1))))
+    start = one._start(state(), window, key=key)
+    imagined = one._actor_loss(state().actor, state(), start, key)[1][0]
+    found, along = one._targets(state(), window, start, imagined, key=key)
+    after = window.next_observation[:, -1]
+    value = np.min(state().target_critics(after, state().target_actor(after)), axis=0)
+    alive = 1.0 - np.asarray(window.terminated[:, -1])
+    expected = np.asarray(one._real_reward(state(), window)) + 0.99 * alive * value
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+    assert along.shape == (0, BATCH)
+
+
+def test_without_terminal_values_the_actor_does_not_see_the_critics(differences: Callable[..., set[str]]) -> None:
+    elsewhere = eqx.tree_at(lambda x: x.critics, state(), jax.tree.map(lambda x: x + 1.0, state().critics))
+    for settings, matters in (((), True), ((("terminal_value", False),), False)):
+        once, other = (update("improve", settings)(before, BATCHES["improve"])[0] for before in (state(), elsewhere))
+        assert ("actor" in differences(once, other)) == matters
+
+
 def test_targets_wait_for_the_third_update_where_c_is_3(differences: Callable[..., set[str]]) -> None:
     step = update("improve", tuple(PAPER.items()))
     states = [state()]
@@ -219,7 +252,7 @@ def test_the_real_step_is_the_first_of_the_expansion(trace: float) -> None:
     """TD(lambda) over the real step and then the imagined ones, by hand."""
     one = agent((("trace", trace), ("target_noise", 0.0)))
     data = jax.tree.map(jnp.asarray, edited(BATCHES["improve"], terminated=((0, -1), 1)))
-    window, key = one._normalized(state(), data), jax.random.key(0)
+    window, key = one.normalized(state(), data), jax.random.key(0)
     start = one._start(state(), window, key=key)
     _, (imagined, _) = one._actor_loss(state().actor, state(), start, key)
     found = one._targets(state(), window, start, imagined, key=key)
@@ -317,7 +350,7 @@ def test_imagination_goes_on_from_the_buffer_up_to_its_depth() -> None:
 
 def test_a_share_of_one_imagines_from_real_states_only_while_the_buffer_is_empty() -> None:
     one = agent((("imagination_ratio", 1.0),))
-    window = one._normalized(state(), jax.tree.map(jnp.asarray, BATCHES["improve"]))
+    window = one.normalized(state(), jax.tree.map(jnp.asarray, BATCHES["improve"]))
     start = jax.jit(lambda s: one._start(s, window, key=jax.random.key(0)))
     np.testing.assert_array_equal(start(state()).observation, window.next_observation[:, -1])
     rows = state().imagined.rows._replace(weight=jnp.full(32, 0.5), depth=jnp.full(32, 2.0))
@@ -328,7 +361,7 @@ def test_a_share_of_one_imagines_from_real_states_only_while_the_buffer_is_empty
 
 def test_rewards_reach_the_critics_in_units_of_value_and_the_model_in_its_own() -> None:
     mixed = jax.tree.map(jnp.asarray, edited(BATCHES["improve"], terminated=((0, -1), 1)))
-    window = agent()._normalized(state(), mixed)
+    window = agent().normalized(state(), mixed)
     reward = np.asarray(mixed.reward)
     np.testing.assert_allclose(agent()._real_reward(state(), window), reward[:, -1] / 2.0, rtol=1e-5)
     np.testing.assert_allclose(window.reward[1:], reward[1:] / 0.8, rtol=1e-5)

@@ -35,9 +35,10 @@ class MBDPG:
         fitted = Sampling(c.fit_batch_size, c.burn_in, c.fit_length)
         cloned = Sampling(c.batch_size, burn_in=0, length=1, demonstrated=True)
         improved = Sampling(c.batch_size, c.burn_in, length=1)
+        fitting = Phase("fitting", c.fits_per_step, c.random_steps, fitted, c.pretraining_fits, self.fit)
         self.phases = (
             Phase("cloning", 0.0, c.random_steps, cloned, c.cloning_updates, self.clone),
-            Phase("fitting", c.fits_per_step, c.random_steps, fitted, c.pretraining_fits, self.fit),
+            *([fitting] if c.horizon > 0 else []),
             Phase("improving", c.updates_per_step, c.random_steps, improved, 0, self.improve),
         )
 
@@ -79,7 +80,7 @@ class MBDPG:
         gradient, metrics = jax.grad(dynamics_loss, has_aux=True)(
             state.dynamics,
             state.scales,
-            self._normalized(state, batch),
+            self.normalized(state, batch),
             burn_in=c.burn_in,
             likelihood=c.likelihood,
             mean_weight=c.mean_weight,
@@ -100,7 +101,7 @@ class MBDPG:
 
     def clone(self, state: State, batch: Batch, *, key: PRNGKeyArray) -> tuple[State, Metrics]:
         """Learn critics (Eq. 14) and actor (Eq. 15) from a batch of demonstrated transitions."""
-        window = self._normalized(state, batch)
+        window = self.normalized(state, batch)
         state = self._evaluate(state, window, key=key)
         observation, action = window.observation[:, -1], window.action[:, -1]
 
@@ -113,7 +114,7 @@ class MBDPG:
     def improve(self, state: State, batch: Batch, *, key: PRNGKeyArray) -> tuple[State, Metrics]:
         """One update of the critics (Eq. 16, 17) and of the actor (Eq. 18) on trajectories imagined after a batch."""
         c = self.config
-        window = self._normalized(state, batch)
+        window = self.normalized(state, batch)
         start_key, target_key, model_key = jax.random.split(key, 3)
         start = self._start(state, window, key=start_key)
         gradient, (imagined, metrics) = jax.grad(self._actor_loss, has_aux=True)(state.actor, state, start, model_key)
@@ -143,7 +144,8 @@ class MBDPG:
             "actor/beta": state.beta,
         }
 
-    def _normalized(self, state: State, batch: Batch) -> Window:
+    def normalized(self, state: State, batch: Batch) -> Window:
+        """A batch in the units that networks see."""
         terminated = batch.terminated
         value = batch.reward / state.return_scale
         return Window(
@@ -240,6 +242,7 @@ class MBDPG:
         seen = imagined.observations[c.first_value :]
         seen = jax.lax.stop_gradient(seen) if printed else seen
         values = objectives.clipped_value(state.critics(seen, imagined.actions[c.first_value :]))
+        values = values if c.terminal_value else jnp.zeros_like(values)
         survival = imagined.survival()
         survival = jax.lax.stop_gradient(survival) if printed else survival
         objective = objectives.policy_objective(
@@ -263,7 +266,8 @@ class MBDPG:
         values = self._target_value(state, seen, key=noise_key)
         values = jnp.broadcast_to(values, imagined.observations.shape[:-1])
         expanded = objectives.expanded_values(imagined.rewards, imagined.continues, values, c.discount, c.trace)
-        after = (1.0 - c.trace) * values[0] + c.trace * expanded[0]  # the real step is the expansion's first
+        # The real step is the expansion's first, and without a horizon its only one.
+        after = (1.0 - c.trace) * values[0] + c.trace * expanded[0] if c.horizon > 0 else values[0]
         if c.imagination_ratio > 0.0:  # where imagination went on from elsewhere, the transition has one step
             one_step = self._target_value(state, window.next_observation[:, -1], key=real_key)
             after = jnp.where(start.depth == 0.0, after, one_step)
@@ -286,5 +290,5 @@ class MBDPG:
 
     def diagnose(self, state: State, batch: Batch, realized_return: Array) -> Metrics:
         """Open-loop error, Q and survival against what happened, gradient norm per imagined depth."""
-        window = self._normalized(state, batch)
+        window = self.normalized(state, batch)
         return instruments.measure(self.config, state, window, realized_return)

@@ -7,7 +7,7 @@ from typing import Literal
 
 from mbdpg.agents.objectives import RewardWeights
 from mbdpg.dynamics.fitting import Likelihood
-from mbdpg.interfaces import require_settings
+from mbdpg.interfaces import require, require_settings
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,7 @@ class Config:
     """Settings of MBDPG; symbols are the paper's."""
 
     horizon: int = 5
-    """Imagined steps H that the critic is expanded over and the policy gradient flows through."""
+    """Imagined steps H of value expansion and policy gradient; 0 learns from real steps alone, without a model."""
     gradient: Literal["full", "eq19"] = "full"
     """Policy gradient: Eq. 18 differentiated through imagined states and policy, or Eq. 19 as printed."""
     planning: Literal["deterministic", "stochastic"] = "deterministic"
@@ -44,6 +44,8 @@ class Config:
     """Reward t weighs beta times: the value terms after it ("remaining"), or one ("uniform", as printed)."""
     first_value: Literal[0, 1] = 0
     """Imagined step at which the value terms of Eq. 18 begin: 1 as printed, 0 to teach the first action by Q too."""
+    terminal_value: bool = True
+    """Whether the actor climbs values (Eq. 18) or, as in Fig. 9c, the imagined rewards alone."""
     trace: float = 0.5
     """Lambda of the value expansion: 1 is Eq. 16, 0 one-step targets, in between longer expansions count less."""
     imagined_weight: float = 0.5
@@ -93,7 +95,7 @@ class Config:
     gaussians: int = 5
     """Components M of the mixture."""
     memory: int = 256
-    """Width of the LSTM."""
+    """Width of the LSTM; 0 leaves it out, and with one Gaussian leaves three dense layers (Fig. 9a)."""
     width: int = 256
     """Width of each of the three dense layers of every network; rewards and ends have two of half as much."""
 
@@ -101,12 +103,20 @@ class Config:
         require_settings(
             self,
             positive=(
-                *("horizon", "batch_size", "updates_per_step", "actor_learning_rate", "critic_learning_rate"),
+                *("batch_size", "updates_per_step", "actor_learning_rate", "critic_learning_rate"),
                 *("actor_clip", "critic_clip", "target_update_every", "fit_length", "fit_batch_size", "fits_per_step"),
-                *("dynamics_learning_rate", "dynamics_clip", "gaussians", "memory", "width"),
+                *("dynamics_learning_rate", "dynamics_clip", "gaussians", "width"),
             ),
             at_most={
                 **{"discount": 1, "trace": 1, "imagination_ratio": 1, "target_update_rate": 1, "average_share": 1},
                 **{"exploration_scatter": 1, "exploration_color": 2},
             },
+        )
+        require(
+            self.first_value == 0 or self.horizon > 0,
+            f"--first-value is {self.first_value}, expected 0 where --horizon is 0: there is no later value",
+        )
+        require(
+            self.terminal_value or self.horizon > 0,
+            "--horizon is 0, expected at least 1 without --terminal-value: there is nothing else to climb",
         )

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from mbdpg.agents import objectives
 from mbdpg.agents.mbdpg.config import Config
 from mbdpg.agents.mbdpg.state import State
-from mbdpg.dynamics.accuracy import DEPTHS
+from mbdpg.dynamics.accuracy import DEPTHS, error_metrics
 from mbdpg.dynamics.fitting import Window, open_loop_error, warm_memory
 from mbdpg.dynamics.imagination import Trajectory, imagine
 from mbdpg.dynamics.mixture import Memory
@@ -45,8 +45,9 @@ def measure(config: Config, state: State, window: Window, realized_return: Float
     exists = window.valid[:, few]
     excess = jnp.sum((imagined.rewards[:NEAR].T - paid) * exists) / jnp.sum(exists)
     ended = jnp.max(window.terminated[:, config.burn_in :] * window.valid[:, config.burn_in :], axis=1)
+    errors = open_loop_error(state.average_dynamics, state.scales, window, burn_in=config.burn_in)
     return (
-        open_loop_error(state.average_dynamics, state.scales, window, burn_in=config.burn_in)
+        error_metrics(errors)
         | objectives.value_bias(value, realized_return)
         | {
             "dynamics/reward_bias": excess * state.return_scale,

@@ -1,0 +1,63 @@
+"""`mbdpg reproduce`: the paper's experiments."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from mbdpg.cli.flags import parse, program
+from mbdpg.experiments.launch import Local, Ray
+from mbdpg.experiments.reproduce import reproduce as reproduce_study
+from mbdpg.experiments.stopping import Stop
+from mbdpg.experiments.studies import ScaleName, StudyName
+from mbdpg.interfaces import UserError, require
+
+
+@dataclass(frozen=True)
+class Reproduce:
+    """Run what is missing of one of the paper's figures or tables, and draw it. Studies share their runs."""
+
+    study: Annotated[tyro.conf.Positional[StudyName], tyro.conf.arg(metavar="STUDY")]
+    """Figure or table: figure-4 to figure-9, table-1."""
+    scale: ScaleName = "quick"
+    """Minutes, hours on two cores, or the paper's 200,000 steps and five seeds."""
+    out: Path | None = None
+    """Folder of all studies of a scale; by default studies/SCALE."""
+    seeds: tuple[int, ...] = ()
+    """Random seeds, instead of the scale's."""
+    engine: Literal["local", "ray"] = "local"
+    """Where runs are made: on this machine, or on a Ray cluster."""
+    workers: int = os.cpu_count() or 1
+    """Runs at once on this machine; each has its share of the cores."""
+    address: str | None = None
+    """Of a Ray cluster whose nodes share the file system, as in 10.0.0.1:6379; by default one is begun here."""
+    gpus: bool = False
+    """With Ray: a GPU for every piece of work, which trains all seeds of a configuration at once."""
+    debug: bool = False
+    """Show the traceback of an error."""
+
+
+def reproduce(args: list[str]) -> None:
+    """Run the verb."""
+    flags = parse(Reproduce, "reproduce", args)
+    require(all(0 <= seed < 2**31 for seed in flags.seeds), f"--seeds are {flags.seeds}, expected from 0 to 2^31 - 1")
+    require(len(set(flags.seeds)) == len(flags.seeds), f"--seeds are {flags.seeds}, expected different ones")
+    require(flags.engine == "ray" or (flags.address is None and not flags.gpus), "--address, --gpus need --engine ray")
+    engine = Local(flags.workers) if flags.engine == "local" else Ray(flags.address, flags.gpus)
+    out = flags.out or Path("studies") / flags.scale
+
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{out} cannot be a folder of studies ({error.strerror}); choose another --out") from error
+
+    def say(line: str) -> None:
+        print(line, flush=True)
+
+    with Stop() as stop:
+        reproduce_study(flags.study, flags.scale, out.absolute(), engine, seeds=flags.seeds, say=say, should_stop=stop)
+        stop.exit_if_asked(f"{program()} reproduce {' '.join(args)}")

@@ -1,0 +1,239 @@
+"""The paper's experiments as data: which runs each figure and table is made of, at three scales."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from mbdpg.agents import mbdpg
+from mbdpg.dynamics.aggregation import Aggregation
+from mbdpg.experiments.config import EnvOptions, RunConfig
+from mbdpg.experiments.presets import PAPER_EPISODE_LIMIT, Preset, agent_config
+from mbdpg.training.loop import Schedule
+
+BOX2D = ("BipedalWalker-v3", "LunarLanderContinuous-v3")
+MUJOCO = ("HalfCheetah-v5", "Hopper-v5", "Ant-v5")
+ABLATED = "BipedalWalker-v3"
+"""The task of Fig. 8 and 9, as in the paper."""
+
+RECORDED = "HalfCheetah-v5"
+"""The task of Fig. 6, 7 and 9a, which the paper does not name."""
+
+ScaleName = Literal["smoke", "quick", "paper"]
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How much of everything a study takes."""
+
+    seeds: tuple[int, ...]
+    schedule: Schedule
+    expert_steps: int
+    """Of the TD3 run whose successes MBDPG starts from."""
+    recorded_steps: int
+    """Of the TD3 run whose replay dynamics models learn from."""
+    model_updates: int
+    """Of each of them."""
+    rivals: Preset
+    tiny: dict[str, Any] = field(default_factory=dict)
+    """Settings of every agent that has them."""
+    success_return: float | None = None
+    """Of the expert; None for what the task is known to need."""
+
+
+SCALES: dict[ScaleName, Scale] = {
+    # Minutes. Nothing is learned: it shows that all parts fit together.
+    "smoke": Scale(
+        seeds=(0,),
+        schedule=Schedule(steps=400, evaluate_every=200, evaluation_episodes=1, log_every=200, checkpoint_every=200),
+        expert_steps=400,
+        recorded_steps=8000,
+        model_updates=20,
+        rivals="default",
+        tiny={
+            **{"random_steps": 200, "width": 16, "memory": 16, "batch_size": 8, "fit_batch_size": 8},
+            **{"pretraining_fits": 10, "cloning_updates": 10, "first_fits": 10, "model_width": 16},
+            **{"population": 8, "plan_elites": 2, "updates_per_step": 0.1, "fits_per_step": 0.1},
+        },
+        success_return=-1e6,
+    ),
+    # Hours on two cores.
+    "quick": Scale(
+        seeds=(0, 1),
+        schedule=Schedule(steps=30_000, evaluate_every=2500, checkpoint_every=5000),
+        expert_steps=200_000,
+        recorded_steps=50_000,
+        model_updates=1000,
+        rivals="default",
+    ),
+    "paper": Scale(
+        seeds=(0, 1, 2, 3, 4),
+        schedule=Schedule(steps=200_000),
+        expert_steps=1_000_000,
+        recorded_steps=50_000,
+        model_updates=3000,
+        rivals="paper",
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Runs that differ in nothing but their seed."""
+
+    label: str
+    config: RunConfig
+    demonstrated: bool = False
+    """Whether they start from an expert's successes."""
+
+    @property
+    def folder(self) -> Path:
+        """Where they lie in a folder of studies, which share them."""
+        return Path(self.config.env) / self.label.replace(" ", "-")
+
+
+@dataclass(frozen=True)
+class Model:
+    """A kind of dynamics model, trained on recorded steps."""
+
+    label: str
+    agent: mbdpg.Config
+    aggregation: Aggregation = "none"
+    members: int = 1
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One set of axes: learning curves, or errors of models over imagined steps."""
+
+    title: str
+    cells: tuple[Cell, ...] = ()
+    models: tuple[Model, ...] = ()
+
+
+@dataclass(frozen=True)
+class Study:
+    """A figure or table of the paper."""
+
+    name: str
+    claim: str
+    """What the paper says of it."""
+    panels: tuple[Panel, ...]
+    as_hours: bool = False
+    """A table of wall-clock time instead of curves."""
+
+
+def study(name: StudyName, scale: ScaleName) -> Study:
+    """What a figure or table is made of at a scale."""
+    return _STUDIES[name](SCALES[scale])
+
+
+def _cell(scale: Scale, env: str, label: str = "mbdpg", algorithm: str = "mbdpg", **settings: Any) -> Cell:
+    """Runs of an algorithm with some settings; `preset` and `demonstrated` are not the agent's."""
+    preset, demonstrated = settings.pop("preset", "default"), settings.pop("demonstrated", False)
+    agent = agent_config(algorithm, preset, env)
+    settings |= {name: value for name, value in scale.tiny.items() if hasattr(agent, name)}
+    options = EnvOptions(max_episode_steps=PAPER_EPISODE_LIMIT)
+    return Cell(label, RunConfig(env, dataclasses.replace(agent, **settings), scale.schedule, options), demonstrated)
+
+
+def _panels(tasks: Sequence[str], scale: Scale) -> tuple[Panel, ...]:
+    def cells(env: str) -> tuple[Cell, ...]:
+        rivals = (_cell(scale, env, name, name, preset=scale.rivals) for name in ("td3", "sac", "pets", "mbpo"))
+        paper = _cell(scale, env, "mbdpg as published", preset="paper", demonstrated=True)
+        return _cell(scale, env), paper, *rivals
+
+    return tuple(Panel(env, cells(env)) for env in tasks)
+
+
+def _figure_4(scale: Scale) -> Study:
+    claim = "MBDPG learns faster than its rivals and is near its best on BipedalWalker at 50,000 steps, TD3 at 200,000."
+    return Study("figure-4", claim, _panels(BOX2D, scale))
+
+
+def _figure_5(scale: Scale) -> Study:
+    claim = (
+        "On Hopper MBDPG is several times better than MBPO and SAC at equal steps; on Ant it learns and PETS does not."
+    )
+    return Study("figure-5", claim, _panels(MUJOCO, scale))
+
+
+def _table_1(scale: Scale) -> Study:
+    claim = "Hours per 200,000 steps, as multiples of TD3's: MBDPG 1.3 to 2.8, PETS 2.8 to 6.8, MBPO 2.0 to 5.8."
+    return Study("table-1", claim, _panels((*BOX2D, *MUJOCO), scale), as_hours=True)
+
+
+def _model(scale: Scale, label: str, aggregation: Aggregation = "none", **settings: Any) -> Model:
+    agent = dataclasses.replace(mbdpg.Config(), **settings)
+    tiny = {name: value for name, value in scale.tiny.items() if hasattr(agent, name) and name not in settings}
+    members = 1 if aggregation == "none" else mbdpg.Config().gaussians
+    return Model(label, dataclasses.replace(agent, **tiny), aggregation, members)
+
+
+def _figure_6(scale: Scale) -> Study:
+    claim = "A mixture balances bias and variance; bagging lowers only the variance, boosting only the bias."
+    models = (
+        _model(scale, "mixture"),
+        _model(scale, "bagging", "bagging", gaussians=1),
+        _model(scale, "boosting", "boosting", gaussians=1),
+        _model(scale, "gaussians=1", gaussians=1),
+    )
+    return Study("figure-6", claim, (Panel(RECORDED, models=models),))
+
+
+def _figure_7(scale: Scale) -> Study:
+    claim = "More Gaussians help up to 5; longer training sequences up to L = 10, and L = 1 drifts off."
+    longest = 50
+    sizes = tuple(
+        _model(scale, f"gaussians={count} fit_length={longest}", gaussians=count, fit_length=longest)
+        for count in (1, 3, 5, 7, 9)
+    )
+    lengths = tuple(
+        _model(scale, "mixture")
+        if length == mbdpg.Config().fit_length
+        else _model(scale, f"gaussians=5 fit_length={length}", fit_length=length)
+        for length in (1, 5, 10, 20, longest)
+    )
+    return Study("figure-7", claim, (Panel("Gaussians", models=sizes), Panel("training length L", models=lengths)))
+
+
+def _figure_8(scale: Scale) -> Study:
+    claim = "Longer horizons learn faster up to H = 20, and 200 still works; C = 3 is best, C = 1 not robust."
+    default = mbdpg.Config().horizon
+    horizons = tuple(
+        _cell(scale, ABLATED) if h == default else _cell(scale, ABLATED, f"mbdpg horizon={h}", horizon=h)
+        for h in (1, 5, 10, 20, 50, 200)
+    )
+    copies = tuple(
+        _cell(scale, ABLATED, f"mbdpg C={c}", target_update_rate=1.0, target_update_every=c) for c in (1, 3, 5, 10)
+    )
+    return Study("figure-8", claim, (Panel("horizon H", horizons), Panel("targets copied every C updates", copies)))
+
+
+def _figure_9(scale: Scale) -> Study:
+    claim = "A plain network drifts off within 200 steps; without demonstrations, values or model learning is slower."
+    whole = _cell(scale, ABLATED)
+    ablated = (
+        ("demonstrations", _cell(scale, ABLATED, "mbdpg from demonstrations", demonstrated=True)),
+        ("terminal value", _cell(scale, ABLATED, "mbdpg without values", terminal_value=False)),
+        ("model", _cell(scale, ABLATED, "mbdpg without model", horizon=0)),
+    )
+    models = (_model(scale, "mixture"), _model(scale, "plain network", gaussians=1, memory=0))
+    curves = (Panel(title, (whole, cell)) for title, cell in ablated)
+    return Study("figure-9", claim, (Panel("dynamics", models=models), *curves))
+
+
+StudyName = Literal["figure-4", "figure-5", "table-1", "figure-6", "figure-7", "figure-8", "figure-9"]
+
+_STUDIES: dict[StudyName, Callable[[Scale], Study]] = {
+    "figure-4": _figure_4,
+    "figure-5": _figure_5,
+    "table-1": _table_1,
+    "figure-6": _figure_6,
+    "figure-7": _figure_7,
+    "figure-8": _figure_8,
+    "figure-9": _figure_9,
+}

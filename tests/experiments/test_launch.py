@@ -1,0 +1,106 @@
+"""Pieces of work in processes of their own: killed, failing, stopped."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mbdpg.experiments.launch import ATTEMPTS, Local, Ray, launch
+from mbdpg.interfaces import UserError
+
+PIECES = """
+import os, signal, time
+from dataclasses import dataclass
+from pathlib import Path
+
+@dataclass(frozen=True)
+class Piece:
+    name: str
+    folder: Path
+    kind: str = "good"
+
+    def count(self):
+        return len(list(self.folder.glob(self.name + ".*")))
+
+    def finished(self):
+        return (self.folder / self.name).exists()
+
+    def __call__(self, should_stop):
+        attempt = self.count() + 1
+        (self.folder / f"{self.name}.{attempt}").write_text(str(sorted(os.sched_getaffinity(0))))
+        print("at work", flush=True)
+        if self.kind == "deadly" or (self.kind == "killed once" and attempt == 1):
+            os.kill(os.getpid(), signal.SIGKILL)
+        if self.kind == "wrong":
+            raise ValueError("a bad\\nnumber")
+        while self.kind == "endless" and not should_stop():
+            time.sleep(0.05)
+        (self.folder / self.name).write_text("saved" if self.kind == "endless" else "done")
+"""
+
+
+@pytest.fixture
+def piece(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Makes pieces of work that other processes can unpickle."""
+    (tmp_path / "pieces_of_work.py").write_text(PIECES)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "pieces_of_work", raising=False)
+    made = importlib.import_module("pieces_of_work")
+    return lambda name, kind="good": made.Piece(name, tmp_path, kind)
+
+
+def test_the_dead_are_taken_up_again_and_the_failed_are_named(piece: Any, tmp_path: Path) -> None:
+    (tmp_path / "before").write_text("done")
+    works = [
+        *(piece("before"), piece("easy"), piece("wrong", "wrong")),
+        *(piece("once", "killed once"), piece("never", "deadly")),
+    ]
+    said: list[str] = []
+    failures = launch(works, Local(2), logs=tmp_path / "logs", say=said.append)
+    assert {work.name: work.count() for work in works} == {
+        **{"before": 0, "easy": 1, "wrong": 1, "once": 2},
+        "never": ATTEMPTS,
+    }
+    assert failures == {"wrong": "a bad number", "never": "its process died (SIGKILL), 3 times"}
+    assert all(piece(name).finished() for name in ("before", "easy", "once"))
+    assert "once: its process died (SIGKILL); going on where it was" in said and "easy: done" in said
+    assert "at work" in (tmp_path / "logs" / "once.log").read_text()
+
+
+def test_each_process_has_cores_of_its_own(piece: Any, tmp_path: Path) -> None:
+    launch([piece("a"), piece("b")], Local(2), logs=tmp_path / "logs", say=lambda line: None)
+    held = [set(numbers((tmp_path / f"{name}.1").read_text())) for name in "ab"]
+    cores = os.sched_getaffinity(0)
+    assert held[0] | held[1] <= cores
+    assert len(cores) < 2 or not held[0] & held[1]
+
+
+def numbers(text: str) -> list[int]:
+    return [int(number) for number in text.strip("[]").split(",")]
+
+
+def test_asked_to_stop_it_lets_each_piece_save(piece: Any, tmp_path: Path) -> None:
+    works = [piece("long", "endless"), piece("waiting")]
+
+    def begun() -> bool:
+        return works[0].count() > 0
+
+    began = time.monotonic()
+    failures = launch(works, Local(1), logs=tmp_path / "logs", say=lambda line: None, should_stop=begun)
+    assert failures == {} and time.monotonic() - began < 60
+    assert (tmp_path / "long").read_text() == "saved"
+    assert works[1].count() == 0
+
+
+def test_no_worker_and_no_ray_are_said_in_one_line(monkeypatch: pytest.MonkeyPatch, piece: Any, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="--workers is 0, expected at least 1"):
+        Local(0)
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(UserError, match=r"needs Ray, which is not installed: pip install 'mbdpg\[ray\]'"):
+        launch([piece("a")], Ray(), logs=tmp_path, say=lambda line: None)

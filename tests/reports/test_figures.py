@@ -1,0 +1,81 @@
+"""A study's figure: numbers as recorded, time over resumes, and panels of both kinds in one picture."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mbdpg.reports.figures import Curves, Errors, evaluations, write_figure
+from mbdpg.storage.metrics import MetricsLog
+from mbdpg.storage.run_folder import RunFolder
+
+
+def make(path: Path, returns: dict[int, float | None], *, seconds: tuple[float, ...] = (), expert: int = 0) -> Path:
+    """A run folder with these evaluations."""
+    RunFolder.create(path, {"env": "E-v0", "algorithm": "td3", "agent": {}, "seed": 0})
+    log = MetricsLog(path)
+    for i, (step, value) in enumerate(returns.items()):
+        row = {"expert_env_steps": expert, "time/seconds": seconds[i] if seconds else 0.0}
+        log.write("eval", step, row if value is None else row | {"eval/return_mean": value})
+    log.close()
+    return path
+
+
+def errors(path: Path, scale: float) -> Path:
+    path.parent.mkdir(exist_ok=True)
+    rows = [f"{depth},{scale * depth},{5.0}" for depth in range(1, 201)]
+    path.write_text("\n".join(["depth,rmse,persistence", *rows]))
+    return path
+
+
+def test_hours_go_on_over_resumes_and_failed_evaluations(tmp_path: Path) -> None:
+    run = make(tmp_path / "run", {0: 1.0, 10: None, 20: 3.0, 30: 4.0}, seconds=(360.0, 720.0, 180.0, 360.0), expert=7)
+    found = evaluations(run)
+    assert [one.env_steps for one in found] == [0, 20, 30] and {one.expert_env_steps for one in found} == {7}
+    assert [one.hours for one in found] == pytest.approx([0.1, 0.25, 0.3])
+
+
+def test_a_figure_has_its_numbers_beside_it(tmp_path: Path) -> None:
+    td3 = [make(tmp_path / "td3" / f"seed-{i}", {0: 0.0, 10: 5.0 + i, 20: 99.0}) for i in range(2)]
+    sac = [make(tmp_path / "sac" / "seed-0", {0: 0.0, 10: 1.0}, expert=40)]
+    fits = [errors(tmp_path / "models" / f"seed-{i}.csv", 1.0 + i) for i in range(2)]
+    panels = [Errors("models", {"mixture": fits}), Curves("E-v0", {"td3": td3, "sac": sac})]
+    lines = write_figure("figure-x", panels, tmp_path)
+    assert lines[2:] == [
+        "models: error after 1, 10, 50, 200 steps, persistence's last",
+        "  mixture (2 seeds): 1.500 ± 0.707 / 15.000 ± 7.071 / 75.000 ± 35.355 / 300.000 ± 141.421 / 5.000",
+        "E-v0",
+        "  td3 (2 seeds) at 20: 99.0 ± 0.0, interquartile mean [99.0, 99.0]",
+        "  sac (1 seed) at 10: 1.0",
+    ]
+    with open(tmp_path / "figure-x.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 2 * 200 + 2 * 3 + 2
+    assert rows[-1] == {
+        **{"panel": "E-v0", "label": "sac", "seed": "0", "env_steps": "10", "expert_env_steps": "40"},
+        **{"return_mean": "1.0", "hours": "0.0", "depth": "", "rmse": "", "persistence": ""},
+    }
+    assert (tmp_path / "figure-x.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_table_of_hours_is_in_multiples_of_td3(tmp_path: Path) -> None:
+    runs = {
+        "td3": [make(tmp_path / f"td3-{i}", {0: 0.0, 10: 1.0}, seconds=(0.0, 1800.0 * (1 + i))) for i in range(2)],
+        "mbdpg": [make(tmp_path / "mbdpg", {0: 0.0, 10: 1.0, 20: 1.0}, seconds=(0.0, 5400.0, 9999.0))],
+    }
+    lines = write_figure("table-x", [Curves("E-v0", runs)], tmp_path, as_hours=True)
+    assert lines[1:] == [
+        "E-v0",
+        "  td3: 0.75 hours for 10 steps (1.0 times td3's)",
+        "  mbdpg: 1.50 hours for 10 steps (2.0 times td3's)",
+    ]
+    assert not (tmp_path / "table-x.png").exists()
+
+
+def test_runs_without_a_common_step_are_left_out_of_the_picture(tmp_path: Path) -> None:
+    runs = {"a": [make(tmp_path / "a", {0: 1.0}), make(tmp_path / "b", {5: 1.0})], "none": []}
+    lines = write_figure("figure-x", [Curves("E-v0", runs)], tmp_path)
+    assert lines[2:] == ["E-v0"] and np.size(lines) == 3
