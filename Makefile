@@ -13,12 +13,12 @@ VENV = .venv
 BIN  = $(VENV)/bin
 PIP  = $(BIN)/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: help setup setup-dev peers train test test-slow test-ray test-gpu check format clean
+.PHONY: help setup setup-dev peers train test test-slow test-extras test-gpu check format clean
 
 help:
 	@echo 'make setup      install mbdpg and its pinned requirements into $(VENV)'
 	@echo 'make train      the ten-minute demonstration: learns $(DEMO_TASK)'
-	@echo 'make test       the test suite, without its slow and GPU parts (make test-slow, test-ray, test-gpu)'
+	@echo 'make test       the test suite, without its slow and GPU parts (make test-slow, test-extras, test-gpu)'
 	@echo 'make check      lint, format, types, import rules'
 	@echo 'make peers      install the programs that benchmarks/ compares with into $(VENV)-peers'
 	@echo 'make format     mend what the linter and the formatter can mend'
@@ -41,8 +41,8 @@ test: setup-dev
 test-slow: setup-dev
 	@$(BIN)/python -m pytest -q -m slow --timeout 3600 $(ARGS)
 
-test-ray: $(VENV)/.installed-extras
-	@$(BIN)/python -m pytest -q -m ray --timeout 600 $(ARGS)
+test-extras: $(VENV)/.installed-extras
+	@$(BIN)/python -m pytest -q -m extras --timeout 600 $(ARGS)
 
 test-gpu: setup-dev
 	@$(BIN)/python -m pytest -q -m gpu --timeout 600 $(ARGS)

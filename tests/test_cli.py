@@ -352,6 +352,24 @@ def test_a_study_that_cannot_be_is_refused(say: Any, flags: Any, said: str) -> N
     assert [path.name for path in Path.cwd().iterdir()] == ["file"]
 
 
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        ((), "nothing is searched; say what with --search"),
+        (("--search", "wings=1:2"), "there is no --wings"),
+        (("--search", "width=1:2", "width=3:4"), "--search has a setting twice"),
+        (("--search", "width=1:2", "--trials", "0"), "--trials is 0, expected at least 1"),
+        (("--search", "width=1:2", "--seeds", "1", "1"), "--seeds are [1, 1], expected"),
+        (("--search", "width=1:2", "--gpus"), "--address, --gpus need --engine ray"),
+    ],
+    ids=str,
+)
+def test_a_sweep_that_cannot_be_is_refused(say: Any, flags: Any, said: str) -> None:
+    check_refused(say("sweep", "Pendulum-v1", *flags), said)
+    check_refused(say("sweep", "NoSuchTask-v0", "--search", "width=1:2"), "NoSuchTask-v0")
+    assert list(Path.cwd().iterdir()) == []
+
+
 def test_a_study_that_is_stopped_says_how_to_go_on(say: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     given: list[Any] = []
 

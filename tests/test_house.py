@@ -123,10 +123,11 @@ def pins(name: str) -> dict[str, str]:
 
 
 PROJECT = PYPROJECT["project"]
+EXTRAS = [*PROJECT["optional-dependencies"]["ray"], *PROJECT["optional-dependencies"]["sweep"]]
 DEPENDENCIES = [
     *((line, "requirements.txt") for line in PROJECT["dependencies"]),
     *((line, "requirements-dev.txt") for line in PROJECT["optional-dependencies"]["dev"]),
-    *((line, "requirements-extras.txt") for line in PROJECT["optional-dependencies"]["ray"]),
+    *((line, "requirements-extras.txt") for line in EXTRAS),
 ]
 
 
@@ -138,7 +139,7 @@ def test_each_dependency_is_pinned_within_its_range_and_explained(line: str, fil
 
 
 def test_what_the_package_imports_is_declared() -> None:
-    lines = [*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["ray"]]
+    lines = [*PROJECT["dependencies"], *EXTRAS]
     declared = {canonicalize_name(Requirement(line).name) for line in lines} | BROUGHT_BY_AN_EXTRA
     imported = {module for path in PACKAGE for module in imported_modules(in_package(path))}
     distributions = importlib.metadata.packages_distributions()

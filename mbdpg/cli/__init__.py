@@ -18,6 +18,7 @@ Learn continuous control from few samples: model-based deterministic policy grad
   mbdpg evaluate RUN         run the learned policy, for example: --episodes 10 --video out.mp4
   mbdpg demonstrate ENV      train an expert with TD3 and record its successful episodes
   mbdpg reproduce STUDY      run and draw one of the paper's figures or tables
+  mbdpg sweep ENV            search for settings, for example: --search horizon=1:20
   mbdpg report RUN...        compare runs: tables with intervals, learning curves
   mbdpg benchmark            measure on this machine: updates, acting, starting, memory
 

@@ -9,9 +9,11 @@ import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
+
+EnvArgument = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ENV")]
 
 
 def parse(kind: type[Any], verb: str, args: Sequence[str]) -> Any:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
 from mbdpg.cli.flags import parse, program
-from mbdpg.experiments.launch import Local, Ray
+from mbdpg.cli.places import Places, engine_of
 from mbdpg.experiments.reproduce import reproduce as reproduce_study
 from mbdpg.experiments.stopping import Stop
 from mbdpg.experiments.studies import ScaleName, StudyName
@@ -29,14 +28,7 @@ class Reproduce:
     """Folder of all studies of a scale; by default studies/SCALE."""
     seeds: tuple[int, ...] = ()
     """Random seeds, instead of the scale's."""
-    engine: Literal["local", "ray"] = "local"
-    """Where runs are made: on this machine, or on a Ray cluster."""
-    workers: int = os.cpu_count() or 1
-    """Runs at once on this machine; each has its share of the cores."""
-    address: str | None = None
-    """Of a Ray cluster whose nodes share the file system, as in 10.0.0.1:6379; by default one is begun here."""
-    gpus: bool = False
-    """With Ray: a GPU for every piece of work, which trains all seeds of a configuration at once."""
+    places: tyro.conf.OmitArgPrefixes[Places] = field(default_factory=Places)
     debug: bool = False
     """Show the traceback of an error."""
 
@@ -46,8 +38,7 @@ def reproduce(args: list[str]) -> None:
     flags = parse(Reproduce, "reproduce", args)
     require(all(0 <= seed < 2**31 for seed in flags.seeds), f"--seeds are {flags.seeds}, expected from 0 to 2^31 - 1")
     require(len(set(flags.seeds)) == len(flags.seeds), f"--seeds are {flags.seeds}, expected different ones")
-    require(flags.engine == "ray" or (flags.address is None and not flags.gpus), "--address, --gpus need --engine ray")
-    engine = Local(flags.workers) if flags.engine == "local" else Ray(flags.address, flags.gpus)
+    engine = engine_of(flags.places)
     out = flags.out or Path("studies") / flags.scale
 
     try:

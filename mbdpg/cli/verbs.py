@@ -1,4 +1,4 @@
-"""The verbs: train, resume, evaluate, demonstrate, benchmark."""
+"""The verbs, and those of them that have no file of their own: resume, evaluate, benchmark."""
 
 from __future__ import annotations
 
@@ -6,54 +6,33 @@ import contextlib
 import dataclasses
 import json
 import os
-import re
-import time
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated
 
 import numpy as np
 import tyro
 
 from mbdpg import envs
-from mbdpg.cli.flags import parse, peek, program
+from mbdpg.cli.demonstrate import demonstrate
+from mbdpg.cli.flags import parse, program
 from mbdpg.cli.report import report
 from mbdpg.cli.reproduce import reproduce
-from mbdpg.experiments import benchmark, expert, presets
+from mbdpg.cli.sweep import sweep
+from mbdpg.cli.train import finish, train
+from mbdpg.experiments import benchmark
 from mbdpg.experiments.compilations import keep_compilations
-from mbdpg.experiments.config import AgentConfig, EnvOptions, RunConfig
-from mbdpg.experiments.run import load_policy, resume, train
+from mbdpg.experiments.config import RunConfig
+from mbdpg.experiments.run import load_policy, resume
 from mbdpg.experiments.stopping import Stop
 from mbdpg.interfaces import require
 from mbdpg.reports.console import RunDisplay
-from mbdpg.reports.curves import draw_curves
 from mbdpg.reports.video import VideoWriter
 from mbdpg.storage.files import replace_durably
 from mbdpg.storage.run_folder import RunFolder
 from mbdpg.training.evaluation import evaluate
-from mbdpg.training.loop import Schedule
 
-EnvArgument = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ENV")]
 RunArgument = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
-
-
-@dataclass(frozen=True)
-class RunOptions:
-    """What is run."""
-
-    algorithm: Literal["mbdpg", "td3", "sac", "pets", "mbpo"] = "mbdpg"
-    """Algorithm to train."""
-    preset: presets.Preset = "default"
-    """Settings that measured best, or those published; other flags change single ones."""
-    seeds: tuple[int, ...] = (0,)
-    """Random seeds; each is a run of its own, all in this process."""
-    out: Path | None = None
-    """Folder that gets one run folder per seed; by default runs/ENV-ALGORITHM-TIME."""
-    demonstrations: str = "none"
-    """File to begin from (see mbdpg demonstrate), `expert` to make one first, or `none`."""
-    debug: bool = False
-    """Show the traceback of an error."""
 
 
 @dataclass(frozen=True)
@@ -91,29 +70,6 @@ class Evaluate:
 
 
 @dataclass(frozen=True)
-class Demonstrate:
-    """Train an expert with TD3, or take one from a run, and record its successful episodes (Section 4.2)."""
-
-    env: EnvArgument
-    """Gymnasium id, as in HalfCheetah-v5."""
-    out: Path
-    """File to write, for example demonstrations.safetensors; the expert's run is kept in demonstrations-expert/."""
-    steps: int = 200_000
-    """Environment steps of the expert's training."""
-    expert: Path | None = None
-    """Run folder of an expert that is trained already, by any algorithm; else TD3 is trained."""
-    episodes: int = 10
-    """Successful episodes to record."""
-    success_return: float | None = None
-    """Least return of a success; by default what the environment is known to need."""
-    seed: int = 0
-    """Random seed of the expert and of its episodes."""
-    env_options: tyro.conf.OmitArgPrefixes[EnvOptions] = field(default_factory=EnvOptions)
-    debug: bool = False
-    """Show the traceback of an error."""
-
-
-@dataclass(frozen=True)
 class Benchmark:
     """Measure on this machine: updates at the paper's sizes, acting, starting, memory. A few minutes."""
 
@@ -123,58 +79,6 @@ class Benchmark:
     """Leave out how the time grows with horizon, batch, width and seeds."""
     debug: bool = False
     """Show the traceback of an error."""
-
-
-def _train_flags(args: list[str], preset: str, agent: AgentConfig) -> Any:
-    """What `mbdpg train` is told, over a preset's settings."""
-    schedule, env_options = presets.run_settings(preset)
-    flat = tyro.conf.OmitArgPrefixes
-    command = dataclasses.make_dataclass(
-        "Train",
-        [
-            ("env", Annotated[EnvArgument, tyro.conf.arg(help="Gymnasium id, as in HalfCheetah-v5.")]),
-            ("run", flat[RunOptions], field(default_factory=RunOptions)),
-            ("schedule", flat[Schedule], field(default=schedule)),
-            ("env_options", flat[EnvOptions], field(default=env_options)),
-            ("agent", flat[type(agent)], field(default=agent)),
-        ],
-        frozen=True,
-    )
-    command.__doc__ = "Learn a policy for a Gymnasium environment."
-    return parse(command, "train", args)
-
-
-def _train(args: list[str]) -> None:
-    algorithm = peek(args, "algorithm", "mbdpg")
-    preset = peek(args, "preset", "default")
-    agent = presets.agent_config(algorithm, preset, args[0] if args else None)
-    flags = _train_flags(args, preset, agent)
-    own = presets.agent_config(algorithm, preset, flags.env)
-    if own != agent:  # the task's id stands elsewhere
-        flags = _train_flags(args, preset, own)
-    keep_compilations()
-    config = RunConfig(flags.env, flags.agent, flags.schedule, flags.env_options)
-    name = re.sub(r"[^A-Za-z0-9.-]+", "-", flags.env)
-    out = flags.run.out or Path("runs") / f"{name}-{algorithm}-{time.strftime('%Y%m%d-%H%M%S')}"
-    if flags.run.demonstrations == "expert":
-        file = out / "demonstrations.safetensors"
-        make_demonstrations(Demonstrate(flags.env, file, seed=flags.run.seeds[0], env_options=flags.env_options))
-        config = dataclasses.replace(config, demonstrations=str(file))
-    elif flags.run.demonstrations != "none":
-        config = dataclasses.replace(config, demonstrations=flags.run.demonstrations)
-    with Stop() as stop:
-        with RunDisplay(config.schedule.steps) as display:
-            runs = train(config, seeds=flags.run.seeds, out=out, on_update=display, should_stop=stop)
-        stop.exit_if_asked(f"{program()} resume {out}")
-    _finish(runs, algorithm, config.env)
-
-
-def _finish(runs: Sequence[Path], algorithm: str, env: str) -> None:
-    """Draw the learning curve beside the run folders and say what to do next."""
-    folder = runs[0].parent
-    draw_curves({algorithm: runs}, folder / "learning-curve.png", title=env)
-    print(f"done: {folder}, learning curve in {folder / 'learning-curve.png'}")
-    print(f"next: {program()} evaluate {runs[0]} --episodes 10 --video {folder / 'policy.mp4'}")
 
 
 def _resume(args: list[str]) -> None:
@@ -197,7 +101,7 @@ def _resume(args: list[str]) -> None:
                 resume(run, steps=flags.steps, allow_import=flags.allow_import, watch=display, should_stop=stop)
             stop.exit_if_asked(f"{program()} resume {flags.run}")
     config = RunFolder.open(runs[0]).config
-    _finish(runs, config["algorithm"], config["env"])
+    finish(runs, config["algorithm"], config["env"])
 
 
 def _evaluate(args: list[str]) -> None:
@@ -231,46 +135,6 @@ def _evaluate(args: list[str]) -> None:
         print(f"video of the first episode in {flags.video}")
 
 
-def _demonstrate(args: list[str]) -> None:
-    flags = parse(Demonstrate, "demonstrate", args)
-    keep_compilations()
-    make_demonstrations(flags)
-
-
-def make_demonstrations(flags: Demonstrate) -> None:
-    """Train the expert unless there is one, then record."""
-    require(flags.episodes >= 1, f"--episodes is {flags.episodes}, expected at least 1")
-    success = expert.success_in(flags.env, flags.env_options, flags.success_return)
-    run = flags.expert
-    if run is None:
-        folder = flags.out.parent / f"{flags.out.stem}-expert"
-        trained = folder / f"seed-{flags.seed}"
-        require(
-            not trained.exists(),
-            f"{trained} has an expert already: take it with --expert {trained}, after more training if it needs that "
-            f"(mbdpg resume {trained} --steps N), or choose another --out",
-        )
-        config = expert.config_of(flags.env, flags.steps, flags.env_options)
-        with Stop() as stop:
-            with RunDisplay(flags.steps) as display:
-                run = train(config, seeds=[flags.seed], out=folder, on_update=display, should_stop=stop)[0]
-            stop.exit_if_asked(
-                f"mbdpg resume {run}, then mbdpg demonstrate {flags.env} --out {flags.out} --expert {run}"
-            )
-    found = expert.record_from(
-        run,
-        flags.env,
-        flags.env_options,
-        episodes=flags.episodes,
-        success_return=success,
-        seed=flags.seed,
-    )
-    found.save(flags.out)
-    returns = found.facts["returns"]
-    print(f"{len(returns)} of {found.facts['tried']} episodes were successes, mean return {np.mean(returns):.1f}")
-    print(f"demonstrations in {flags.out}; they cost {found.expert_env_steps} environment steps")
-
-
 def _benchmark(args: list[str]) -> None:
     flags = parse(Benchmark, "benchmark", args)
     file = flags.json
@@ -284,11 +148,12 @@ def _benchmark(args: list[str]) -> None:
 
 
 VERBS = {
-    "train": _train,
+    "train": train,
     "resume": _resume,
     "evaluate": _evaluate,
-    "demonstrate": _demonstrate,
+    "demonstrate": demonstrate,
     "reproduce": reproduce,
+    "sweep": sweep,
     "report": report,
     "benchmark": _benchmark,
 }

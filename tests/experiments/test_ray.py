@@ -23,7 +23,7 @@ from mbdpg.experiments.reproduce import Training
 from mbdpg.interfaces import UserError
 from mbdpg.training.loop import Schedule
 
-pytestmark = [pytest.mark.ray, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.extras, pytest.mark.timeout(600)]
 
 SCHEDULE = Schedule(
     steps=3000, evaluate_every=500, evaluation_episodes=1, log_every=100, checkpoint_every=100, cycle=50

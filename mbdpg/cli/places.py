@@ -1,0 +1,35 @@
+"""Flags of verbs that run many things: where they are run."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import Literal
+
+from mbdpg.experiments.launch import Local, Ray
+from mbdpg.interfaces import require
+
+
+@dataclass(frozen=True)
+class Places:
+    """This machine, or a Ray cluster."""
+
+    engine: Literal["local", "ray"] = "local"
+    """Where runs are made: on this machine, or on a Ray cluster."""
+    workers: int = os.cpu_count() or 1
+    """Runs at once on this machine; each has its share of the cores."""
+    address: str | None = None
+    """Of a Ray cluster whose nodes share the file system, as in 10.0.0.1:6379; by default one is begun here."""
+    gpus: bool = False
+    """With Ray: a GPU for every piece of work, which trains all its seeds at once."""
+
+
+def engine_of(places: Places) -> Local | Ray:
+    """What the flags say.
+
+    Raises:
+        UserError: they contradict each other.
+    """
+    ray = places.engine == "ray"
+    require(ray or (places.address is None and not places.gpus), "--address, --gpus need --engine ray")
+    return Ray(places.address, places.gpus) if ray else Local(places.workers)

@@ -1,0 +1,74 @@
+"""`mbdpg sweep`: search for settings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from mbdpg.cli.flags import program
+from mbdpg.cli.places import Places, engine_of
+from mbdpg.cli.train import default_folder, run_flags
+from mbdpg.experiments import presets
+from mbdpg.experiments.config import RunConfig
+from mbdpg.experiments.stopping import Stop
+from mbdpg.experiments.sweep import Search, sweep as search_settings
+from mbdpg.interfaces import require
+
+
+@dataclass(frozen=True)
+class SweepOptions:
+    """What is searched, and where."""
+
+    algorithm: Literal["mbdpg", "td3", "sac", "pets", "mbpo"] = "mbdpg"
+    """Algorithm to train."""
+    preset: presets.Preset = "default"
+    """Settings that measured best, or those published; other flags change single ones."""
+    search: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUES...")] = ()
+    """Settings and their values: horizon=1:20, critic-learning-rate=1e-5:1e-3:log, gradient=full,eq19."""
+    trials: int = 20
+    """Choices of settings to train."""
+    seeds: tuple[int, ...] = (0,)
+    """Random seeds of every trial, in one process; their mean counts."""
+    prune: bool = True
+    """Give a trial up that is worse at a step than the median of the others was."""
+    out: Path | None = None
+    """Folder of the sweep; by default sweeps/ENV-ALGORITHM-TIME. A sweep goes on where it was."""
+    places: tyro.conf.OmitArgPrefixes[Places] = field(default_factory=Places)
+    debug: bool = False
+    """Show the traceback of an error."""
+
+
+def sweep(args: list[str]) -> None:
+    """Run the verb."""
+    flags: Any = run_flags("sweep", "Search for the settings that learn best, with Optuna.", SweepOptions, args)
+    run = flags.run
+    config = RunConfig(flags.env, flags.agent, flags.schedule, flags.env_options)
+    require(run.trials >= 1, f"--trials is {run.trials}, expected at least 1")
+    require(len(run.search) > 0, "nothing is searched; say what with --search, for example --search horizon=1:20")
+    different = 0 < len(run.seeds) == len(set(run.seeds)) and all(0 <= seed < 2**31 for seed in run.seeds)
+    require(different, f"--seeds are {list(run.seeds)}, expected numbers from 0 to 2^31 - 1, all different")
+    searches = [Search.parse(text, config.agent) for text in run.search]
+    require(len({search.name for search in searches}) == len(searches), "--search has a setting twice")
+    out = (run.out or default_folder("sweeps", config)).absolute()
+    config.make_env().close()  # a wrong task is better said once than by every trial
+
+    def say(line: str) -> None:
+        print(line, flush=True)
+
+    with Stop() as stop:
+        search_settings(
+            config,
+            searches,
+            trials=run.trials,
+            seeds=run.seeds,
+            prune=run.prune,
+            out=out,
+            engine=engine_of(run.places),
+            say=say,
+            should_stop=stop,
+        )
+        again = args if run.out else [*args, "--out", str(out)]
+        stop.exit_if_asked(f"{program()} sweep {' '.join(again)}")
