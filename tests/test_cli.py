@@ -438,24 +438,41 @@ def test_the_last_of_two_algorithms_is_the_one_that_is_trained(say: Any, toys: N
     assert RunFolder.open(Path("run/seed-0")).config["algorithm"] == "td3"
 
 
-def test_report_compares_runs_and_draws_them(say: Any, toys: None) -> None:
+def test_report_compares_runs_in_tables_and_on_a_page(say: Any, toys: None) -> None:
     for seed in ("0", "1"):
         assert say("train", "Pendulum-v1", *TINY, "--seeds", seed, "--out", f"runs/{seed}").status == 0
-    said = say("report", "runs", "--out", "pictures")
+    said = say("report", "runs", "--out", "new/page.html")
     assert said.status == 0, said.err
     lines = said.out.splitlines()
     assert lines[0] == "Pendulum-v1" and lines[1].startswith("return at 40 steps: ")
-    assert lines[2].startswith("  td3 (2 runs): -") and lines[3] == "  learning curves in pictures/Pendulum-v1.png"
-    assert Path("pictures/Pendulum-v1.png").read_bytes().startswith(b"\x89PNG")
-    check_refused(say("report", "pictures"), "pictures is no run folder and has none in it")
+    assert lines[2].startswith("  td3 (2 runs): -")
+    assert lines[3] == "page with curves, settings and more: new/page.html"
+    assert Path("new/page.html").read_text().startswith("<!DOCTYPE html>")
+    check_refused(say("report", "new"), "new is no run folder and has none in it")
     check_refused(
         say("report", "runs", "--at", "30"), "--at is 30, expected a step at which all were evaluated: 0, 20, 40"
     )
     check_refused(say("report"), "expected run folders")
-    Path("file").touch()
-    check_refused(say("report", "runs", "--out", "file"), "--out is file, which cannot be a folder: File exists")
+
+
+def test_report_without_a_common_step_is_refused_but_for_its_page(say: Any, toys: None) -> None:
+    for seed in ("0", "1"):
+        assert say("train", "Pendulum-v1", *TINY, "--seeds", seed, "--out", f"runs/{seed}").status == 0
     Path("runs/0/seed-0/metrics.jsonl").write_text("")
     check_refused(say("report", "runs"), "no evaluation at the same step")
+    said = say("report", "runs", "--out", "page.html")
+    assert said.status == 0 and "no evaluation at the same step" in said.out
+
+
+def test_a_page_that_cannot_be_written_is_refused_before_anything_is_read(say: Any) -> None:
+    Path("file").touch()
+    Path("folder.html").mkdir()
+    check_refused(
+        say("report", "missing", "--out", "page.png"), "--out is page.png, expected a name that ends in .html"
+    )
+    check_refused(say("report", "missing", "--out", "folder.html"), "--out is folder.html, a folder")
+    check_refused(say("report", "missing", "--out", "file/page.html"), "cannot write file/page.html")
+    check_refused(say("report", "missing", "--out", f"{'x' * 300}.html"), "File name too long")
 
 
 def test_a_run_that_ends_before_it_learns_says_so(say: Any, toys: None) -> None:

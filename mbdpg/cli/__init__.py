@@ -19,7 +19,7 @@ Learn continuous control from few samples: model-based deterministic policy grad
   mbdpg demonstrate ENV      train an expert with TD3 and record its successful episodes
   mbdpg reproduce STUDY      run and draw one of the paper's figures or tables
   mbdpg sweep ENV            search for settings, for example: --search horizon=1:20
-  mbdpg report RUN...        compare runs: tables with intervals, learning curves
+  mbdpg report RUN...        compare runs: tables with intervals; --out report.html for curves and more
   mbdpg benchmark            measure on this machine: updates, acting, starting, memory
 
 Every verb has its own --help; --debug shows tracebacks.

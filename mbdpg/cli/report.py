@@ -9,21 +9,22 @@ from typing import Annotated
 import tyro
 
 from mbdpg.cli.flags import parse
-from mbdpg.interfaces import UserError, require
-from mbdpg.reports.comparison import grouped, run_folders, table
-from mbdpg.reports.curves import draw_curves
+from mbdpg.interfaces import require
+from mbdpg.reports.comparison import NO_COMMON_STEP, grouped, run_folders, table
+from mbdpg.reports.contents import contents, read_environments
+from mbdpg.reports.page import check_place, write_page
 
 
 @dataclass(frozen=True)
 class Report:
-    """Compare runs: for each environment a table of what every algorithm and setting reached, and a picture."""
+    """Compare runs: for each environment a table of what every algorithm and setting reached, and a page with more."""
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN...")]
     """Run folders, or folders that hold some."""
     at: int | None = None
     """Environment steps at which they are compared; by default the last at which all were evaluated."""
     out: Path | None = None
-    """Folder for a picture of the learning curves per environment; by default none is drawn."""
+    """HTML file for curves, tables, diagnostics, settings and videos, which needs no network; by default none."""
     debug: bool = False
     """Show the traceback of an error."""
 
@@ -33,13 +34,12 @@ def report(args: list[str]) -> None:
     flags = parse(Report, "report", args)
     require(len(flags.runs) > 0, "no run was given; expected run folders, or a folder that holds some")
     if flags.out is not None:
-        try:
-            flags.out.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UserError(f"--out is {flags.out}, which cannot be a folder: {error.strerror}") from error
-    for env, groups in grouped(run_folders(flags.runs)).items():
-        print(env, *table(groups, at=flags.at), sep="\n")
-        if flags.out is not None:
-            picture = flags.out / f"{env.replace('/', '-').replace(':', '-')}.png"
-            draw_curves(groups, picture, title=env)
-            print(f"  learning curves in {picture}")
+        check_place(flags.out)
+    environments = read_environments(grouped(run_folders(flags.runs)), at=flags.at)
+    for environment in environments:
+        # Without a common step the page still has the curves, and says what is missing.
+        lines = table(environment.rows) if environment.rows or flags.out is None else [NO_COMMON_STEP]
+        print(environment.name, *lines, sep="\n")
+    if flags.out is not None:
+        write_page(flags.out, contents(environments))
+        print(f"page with curves, settings and more: {flags.out}")

@@ -4,19 +4,30 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
-
-import numpy as np
+from typing import Any, NamedTuple
 
 from mbdpg.interfaces import require
-from mbdpg.reports.curves import learning_curve
-from mbdpg.reports.statistics import probability_of_improvement, summarize
+from mbdpg.reports.record import Curve
+from mbdpg.reports.statistics import Summary, probability_of_improvement, summarize
 from mbdpg.storage.run_folder import RunFolder
 
 LOOKS_ON = {"steps", "evaluate_every", "evaluation_episodes", "log_every", "checkpoint_every"}
 """Settings that change nothing of what is learned at a step."""
+
+NO_COMMON_STEP = "these runs have no evaluation at the same step; train them further, or report fewer"
+
+
+class Row(NamedTuple):
+    """What a group of runs reached."""
+
+    label: str
+    steps: tuple[int, int]
+    """Environment steps of the scores: the fewest and the most."""
+    summary: Summary
+    beaten: float | None
+    """How often a run of the group with the highest mean is better than one of these; None for that group."""
 
 
 def run_folders(paths: Sequence[Path]) -> list[Path]:
@@ -61,34 +72,66 @@ def _labelled(groups: dict[str, list[Path]], settings: dict[str, dict[str, Any]]
     return labels
 
 
-def table(groups: dict[str, list[Path]], *, at: int | None = None) -> list[str]:
-    """Lines that say what each group reached.
+def compare(curves: Mapping[str, Sequence[Curve]], *, at: int | None = None) -> list[Row]:
+    """What each group reached at a step; no row if there is no step at which all runs were evaluated.
 
     Args:
-        groups: run folders by label.
+        curves: of the runs, by the label of their group.
         at: environment steps at which they are compared; by default the last at which all runs were evaluated.
 
     Raises:
-        UserError: there is no step at which all runs were evaluated, or not that one.
+        UserError: not all runs were evaluated at that step, but all were at others.
     """
-    curves = {label: [learning_curve(run) for run in runs] for label, runs in groups.items()}
     shared = set.intersection(*(set(curve) for own in curves.values() for curve in own))
-    require(bool(shared), "these runs have no evaluation at the same step; train them further, or report fewer")
+    if not shared:
+        return []
     step = max(shared) if at is None else at
     require(step in shared, f"--at is {step}, expected a step at which all were evaluated: {_some(sorted(shared))}")
-    scores = {label: [curve[step] for curve in own] for label, own in curves.items()}
-    best = max(scores, key=lambda label: float(np.mean(scores[label])))
+    return _rows({label: [(step, curve[step]) for curve in own] for label, own in curves.items()})
+
+
+def compare_last(curves: Mapping[str, Sequence[Curve]]) -> list[Row]:
+    """What each group reached at the last evaluation of each of its runs; groups without any are left out."""
+    ends = {label: [max(curve.items()) for curve in own if curve] for label, own in curves.items()}
+    return _rows({label: own for label, own in ends.items() if own})
+
+
+def _rows(points: Mapping[str, Sequence[tuple[int, float]]]) -> list[Row]:
+    """A row per label of (step, score)s."""
+    scores = {label: [score for _, score in own] for label, own in points.items()}
+    found = {label: summarize(own) for label, own in scores.items()}
+    best = max(found, key=lambda label: found[label].mean, default=None)
+    rows = []
+    for label, own in points.items():
+        steps = [step for step, _ in own]
+        beaten = None if best is None or label == best else probability_of_improvement(scores[best], scores[label])
+        rows.append(Row(label, (min(steps), max(steps)), found[label], beaten))
+    return rows
+
+
+def table(rows: Sequence[Row]) -> list[str]:
+    """Lines that say what each group reached at a step.
+
+    Raises:
+        UserError: there is no row.
+    """
+    require(bool(rows), NO_COMMON_STEP)
     names = "mean ± std, interquartile mean [95 % interval]"
-    names += f", and how often {best} is better" if len(scores) > 1 else ""
-    lines = [f"return at {step:,} steps: {names}"]
-    for label, own in scores.items():
-        found = summarize(own)
+    names += f", and how often {best_of(rows)} is better" if len(rows) > 1 else ""
+    lines = [f"return at {rows[0].steps[1]:,} steps: {names}"]
+    for row in rows:
+        found = row.summary
         spread = f" ± {found.std:,.1f}" if found.seeds > 1 else ""
         interval = f", {found.interquartile_mean:,.1f} [{found.low:,.1f}, {found.high:,.1f}]" if found.seeds > 1 else ""
-        beaten = "" if label == best else f", {probability_of_improvement(scores[best], own):.0%}"
+        beaten = "" if row.beaten is None else f", {row.beaten:.0%}"
         count = f"{found.seeds} run{'s' * (found.seeds > 1)}"
-        lines.append(f"  {label} ({count}): {found.mean:,.1f}{spread}{interval}{beaten}")
+        lines.append(f"  {row.label} ({count}): {found.mean:,.1f}{spread}{interval}{beaten}")
     return lines
+
+
+def best_of(rows: Sequence[Row]) -> str:
+    """Label of the group with the highest mean."""
+    return next(row.label for row in rows if row.beaten is None)
 
 
 def _some(steps: list[int]) -> str:

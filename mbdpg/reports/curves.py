@@ -13,8 +13,8 @@ matplotlib.use("Agg")  # no display is ever needed
 from matplotlib import pyplot as plt
 
 from mbdpg.interfaces import UserError
+from mbdpg.reports.record import learning_curve
 from mbdpg.storage.files import replace_durably
-from mbdpg.storage.metrics import read_metrics
 
 
 def draw_curves(groups: Mapping[str, Sequence[Path]], path: Path, *, title: str) -> None:
@@ -51,11 +51,3 @@ def draw_curves(groups: Mapping[str, Sequence[Path]], path: Path, *, title: str)
         replace_durably(path, picture.getvalue())  # and not what a link there points to
     except OSError as error:
         raise UserError(f"cannot write {path}: {error.strerror}") from error
-
-
-def learning_curve(run: Path) -> dict[int, float]:
-    """Mean return by environment steps, without evaluations in which every episode failed."""
-    rows = read_metrics(run, "eval")
-    absent = [None] * len(rows["env_steps"])  # of an evaluation of which only the timings were written
-    pairs = zip(rows["env_steps"], rows.get("eval/return_mean", absent), strict=True)
-    return {step: value for step, value in pairs if value is not None}
