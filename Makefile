@@ -13,12 +13,12 @@ VENV = .venv
 BIN  = $(VENV)/bin
 PIP  = $(BIN)/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: help setup setup-dev peers train test test-slow test-extras test-gpu check format clean
+.PHONY: help setup setup-dev peers train test test-slow test-extras test-gpu test-browser check format clean
 
 help:
 	@echo 'make setup      install mbdpg and its pinned requirements into $(VENV)'
 	@echo 'make train      the ten-minute demonstration: learns $(DEMO_TASK)'
-	@echo 'make test       the test suite, without its slow and GPU parts (make test-slow, test-extras, test-gpu)'
+	@echo 'make test       the test suite (also: make test-slow, test-extras, test-browser, test-gpu)'
 	@echo 'make check      lint, format, types, import rules'
 	@echo 'make peers      install the programs that benchmarks/ compares with into $(VENV)-peers'
 	@echo 'make format     mend what the linter and the formatter can mend'
@@ -46,6 +46,9 @@ test-extras: $(VENV)/.installed-extras
 
 test-gpu: setup-dev
 	@$(BIN)/python -m pytest -q -m gpu --timeout 600 $(ARGS)
+
+test-browser: setup-dev
+	@$(BIN)/python -m pytest -q -m browser $(ARGS)
 
 check: setup-dev
 	$(BIN)/ruff check --quiet --output-format concise

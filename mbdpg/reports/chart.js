@@ -48,6 +48,16 @@ function ticks(low, high, step) {
   return Array.from({ length: Math.floor(high / step + 1e-9) - first + 1 }, (_, index) => (first + index) * step);
 }
 
+/** Some of 1, 2 and 5 times the powers of ten between two logarithms, as numbers; at most `count` if few are enough. */
+function logTicks(low, high, count) {
+  const choices = [[1, 2, 5], [1, 3], [1]].map((factors) => {
+    const found = [];
+    for (let power = Math.floor(low); power <= high; power++) found.push(...factors.map((factor) => factor * 10 ** power));
+    return found.filter((tick) => Math.log10(tick) >= low && Math.log10(tick) <= high);
+  });
+  return choices.find((found) => found.length <= count) ?? choices[2];
+}
+
 /** Exponential moving average from the first value on; what is missing stays missing. */
 function smooth(values, weight) {
   let sum = 0, norm = 0;
@@ -112,20 +122,23 @@ function scalesOf(points, chart, width, height, axis) {
   if (!there.length || width < 80) return null;
   const bounds = (values) => values.reduce(([low, high], value) => [Math.min(low, value), Math.max(high, value)], [Infinity, -Infinity]);
   let [left, right] = bounds(there.map((point) => point.x));
-  let [bottom, top] = bounds([...there.map((point) => point.y), ...(known(chart.reference) ? [chart.reference] : [])]);
+  const bend = chart.logarithmic ? Math.log10 : (value) => value;
+  let [bottom, top] = bounds([...there.map((point) => point.y), ...(known(chart.reference) ? [chart.reference] : [])].map(bend));
   left = Math.min(left, 0);
   if (right === left) right = left + 1;
   const room = (top - bottom || Math.abs(top) || 1) * 0.05;
   [bottom, top] = [bottom - room, top + room];
-  const yStep = niceStep(bottom, top, height / 45), yTicks = ticks(bottom, top, yStep);
-  const yLabels = yTicks.map((tick) => format(tick, yStep));
+  const yStep = niceStep(bottom, top, height / 45);
+  const yTicks = chart.logarithmic ? logTicks(bottom, top, height / 30) : ticks(bottom, top, yStep);
+  const yLabels = yTicks.map((tick) => format(tick, chart.logarithmic ? tick : yStep));
+  const read = (value) => format(value, (chart.logarithmic ? value : yStep) / 100);
   const margin = { left: 12 + 7 * Math.max(...yLabels.map((label) => label.length)), right: 24, top: 10, bottom: 26 };
   const inner = { width: width - margin.left - margin.right, height: height - margin.top - margin.bottom };
   const xStep = niceStep(left, right, inner.width / (axis === "hours" ? 70 : 95)), xTicks = ticks(left, right, xStep);
   return {
-    width, height, margin, inner, xStep, yStep, yTicks, yLabels, xTicks,
+    width, height, margin, inner, xStep, yTicks, yLabels, xTicks, read,
     x: (value) => margin.left + ((value - left) / (right - left)) * inner.width,
-    y: (value) => margin.top + ((top - value) / (top - bottom)) * inner.height,
+    y: (value) => margin.top + ((top - bend(value)) / (top - bottom)) * inner.height,
     back: (pixel) => left + ((pixel - margin.left) / inner.width) * (right - left),
   };
 }
@@ -156,7 +169,7 @@ function picture(visible, scales, chart, state) {
   const stroke = (one, kind, points) => root.append(colored(
     shape("path", { class: `${kind}${one.second ? " dashed" : ""}`, "data-group": one.index, d: path(points, scales) }), one.index));
   for (const one of visible) if (one.runs.length > 1) one.runs.forEach((points) => stroke(one, "run", points));
-  for (const one of visible) {
+  for (const one of visible.filter((other) => other.mean.length)) {
     stroke(one, "mean", one.mean);
     if (one.mean.length === 1) root.append(colored(  // a path of one point is invisible
       shape("circle", { class: "dot", cx: scales.x(one.mean[0].x), cy: scales.y(one.mean[0].y), r: 3 }), one.index));
@@ -181,10 +194,10 @@ function readable(root, visible, scales, tooltip, state) {
       const point = nearest(one.mean, x, (other) => other.x);
       marks.append(colored(shape("circle", { class: "dot", cx: scales.x(point.x), cy: scales.y(point.y), r: 3.5 }), one.index));
       const notes = [];
-      if (point.count > 1) notes.push(`${format(point.low, scales.yStep / 100)} – ${format(point.high, scales.yStep / 100)}`);
+      if (point.count > 1) notes.push(`${scales.read(point.low)} to ${scales.read(point.high)}`);
       if (point.x !== x) notes.push(`at ${format(point.x, step)}`);
       lines.push([swatch(one.index), element("span", { class: "label" }, one.line.label ? `${one.label}, ${one.line.label}` : one.label),
-        element("span", { class: "value" }, format(point.y, scales.yStep / 100)), element("span", { class: "muted" }, notes.join(", "))]);
+        element("span", { class: "value" }, scales.read(point.y)), element("span", { class: "muted" }, notes.join(", "))]);
     }
     tooltip.replaceChildren(element("div", { class: "place" }, `${format(x, step < 1 && state.axis !== "hours" ? 1 : step)} ${AXES[state.axis]}`),
       ...lines.map((line) => element("div", { class: "row" }, ...line)));

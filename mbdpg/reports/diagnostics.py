@@ -29,6 +29,8 @@ class Chart(NamedTuple):
     lines: list[Line]
     reference: float | None = None
     """What a perfect model or critic has, or the worth of a trivial one."""
+    logarithmic: bool = False
+    """Ratios, all above 0."""
 
 
 RETURN = Chart("Mean evaluation return", "", [Line("return", "")])
@@ -61,7 +63,9 @@ def series_of(run: Record) -> dict[str, Values]:
     for name in run.evaluations:
         if match := re.fullmatch(r"dynamics/rmse_k(\d{1,4})", name):
             persistence = run.column(f"dynamics/persistence_k{match[1]}")
-            ratio = _combined(run.column(name), persistence, lambda error, still: error / still if still > 0 else None)
+            ratio = _combined(
+                run.column(name), persistence, lambda error, still: error / still if min(error, still) > 0 else None
+            )
             found[f"error_{int(match[1])}"] = ratio
     return {name: values for name, values in found.items() if any(value is not None for value in values)}
 
@@ -70,17 +74,14 @@ def diagnostics(names: Iterable[str]) -> list[Chart]:
     """The charts, beside that of the return, for which there are series of these names."""
     known = set(names)
     depths = sorted(int(name.removeprefix("error_")) for name in known if name.startswith("error_"))
-    errors = [
-        Chart(
-            f"Model error {depth} step{'s' * (depth > 1)} ahead",
-            "relative to predicting no change",
-            [Line(f"error_{depth}", "")],
-            1.0,
-        )
-        for depth in depths
-    ]
+    errors = [_error(depth) for depth in depths]
     rest = [chart for chart in (_CRITIC, _SURVIVAL, _REWARD, _RANGE) if known & {line.series for line in chart.lines}]
     return errors + rest
+
+
+def _error(depth: int) -> Chart:
+    title = f"Model error {depth} step{'s' * (depth > 1)} ahead"
+    return Chart(title, "relative to predicting no change", [Line(f"error_{depth}", "")], 1.0, logarithmic=True)
 
 
 def _combined(ours: Values, theirs: Values, of: Callable[[float, float], float | None]) -> Values:

@@ -37,8 +37,8 @@ def differences(groups: Mapping[str, Sequence[Record]]) -> list[Difference]:
 def machine(config: Mapping[str, Any]) -> str:
     """The machine of a run in a few words."""
     parts = setting(config, "machine")
-    cores = parts.get("cores")
-    return f"{text(parts.get('cpu'))}, {text(cores)} core{'s' * (cores != 1)}, {text(parts.get('platform'))}"
+    cores, system = parts.get("cores"), text(parts.get("platform")).partition("-")[0]
+    return f"{text(parts.get('cpu'))}, {text(cores)} core{'s' * (cores != 1)}, {system}"
 
 
 def _flat(config: Mapping[str, Any]) -> dict[str, str]:

@@ -57,7 +57,7 @@ function table(content, groups) {
   const head = content.header.map((text, column) => element("th", { scope: "col", ...align(column) }, text));
   const rows = content.rows.map((row) => element("tr", {}, ...row.map((text, column) => {
     if (column) return element("td", align(column), text);
-    return element("th", { scope: "row" }, ...(own ? [swatch(labels.indexOf(text)), " "] : []), text);
+    return element("th", { scope: "row" }, own ? element("span", { class: "group" }, swatch(labels.indexOf(text)), text) : text);
   })));
   return element("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": content.title },
     element("table", {}, element("thead", {}, element("tr", {}, ...head)), element("tbody", {}, ...rows)));

@@ -90,7 +90,7 @@ def test_without_a_common_step_a_note_says_so_and_the_last_evaluations_remain(tm
 
 
 def test_wall_clock_is_compared_with_td3_at_the_same_step(tmp_path: Path, make: Make) -> None:
-    machine = {"machine": {"cpu": "Fast", "cores": 2, "platform": "Linux"}}
+    machine = {"machine": {"cpu": "Fast", "cores": 2, "platform": "Linux-6.1-x86_64"}}
     hour = {100: {"time/seconds": 3600.0}, 200: {"time/seconds": 7200.0}}
     make(tmp_path / "a", {100: 0.0, 200: 1.0}, evaluations=hour, config=machine)
     three = {100: {"time/seconds": 3 * 3600.0}}
