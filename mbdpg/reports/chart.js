@@ -6,7 +6,7 @@ const AXES = {
   expert: "environment steps, the expert's included",
   hours: "hours of wall-clock",
 };
-const HUES = [255, 45, 150, 310, 20, 95, 200, 345];
+const HUES = [255, 45, 150, 310, 20, 95, 200, 345, 70, 228, 122, 282, 175, 328, 2, 32];
 const SVG = "http://www.w3.org/2000/svg";
 
 function fill(node, attributes, children) {
@@ -190,13 +190,13 @@ function readable(root, visible, scales, tooltip, state) {
     const step = scales.xStep / 100, pixel = scales.x(x), lines = [];
     marks.replaceChildren(shape("line", { class: "cursor", x1: pixel, x2: pixel, y1: scales.margin.top, y2: scales.margin.top + scales.inner.height }));
     for (const one of visible) {
-      if (!one.mean.length) continue;
+      if (!one.mean.length || x < one.mean[0].x || x > one.mean.at(-1).x) continue;
       const point = nearest(one.mean, x, (other) => other.x);
       marks.append(colored(shape("circle", { class: "dot", cx: scales.x(point.x), cy: scales.y(point.y), r: 3.5 }), one.index));
       const notes = [];
       if (point.count > 1) notes.push(`${scales.read(point.low)} to ${scales.read(point.high)}`);
       if (point.x !== x) notes.push(`at ${format(point.x, step)}`);
-      lines.push([swatch(one.index), element("span", { class: "label" }, one.line.label ? `${one.label}, ${one.line.label}` : one.label),
+      lines.push([swatch(one.index), element("span", { class: "label" }, one.label), element("span", {}, one.line.label),
         element("span", { class: "value" }, scales.read(point.y)), element("span", { class: "muted" }, notes.join(", "))]);
     }
     tooltip.replaceChildren(element("div", { class: "place" }, `${format(x, step < 1 && state.axis !== "hours" ? 1 : step)} ${AXES[state.axis]}`),
