@@ -20,7 +20,7 @@ from mbdpg.experiments.config import RunConfig
 from mbdpg.experiments.launch import Local, Ray, launch
 from mbdpg.experiments.work import Training
 from mbdpg.interfaces import UserError, flag_of, require
-from mbdpg.reports.curves import learning_curve
+from mbdpg.reports.record import learning_curve
 from mbdpg.storage.files import DamagedFileError, parse_object, read_checked, replace_durably
 from mbdpg.training.loop import Update
 

@@ -15,9 +15,9 @@ import numpy as np
 matplotlib.use("Agg")  # no display is ever needed
 from matplotlib import pyplot as plt
 
+from mbdpg.reports.record import Record
 from mbdpg.reports.statistics import summarize
 from mbdpg.storage.files import replace_durably
-from mbdpg.storage.metrics import read_metrics
 
 COLUMNS: tuple[Any, ...] = (
     *("panel", "label", "seed", "env_steps", "expert_env_steps", "return_mean", "hours"),
@@ -68,19 +68,12 @@ class Errors:
 
 
 def evaluations(run: Path) -> list[Evaluation]:
-    """A run's evaluations but those in which every episode failed; the clock goes on over resumes."""
-    rows = read_metrics(run, "eval")
-    found, before, last = [], 0.0, 0.0
-    absent = [None] * len(rows["env_steps"])
-    columns = ("env_steps", "expert_env_steps", "eval/return_mean", "time/seconds")
-    for step, expert, mean, seconds in zip(*(rows.get(name, absent) for name in columns), strict=True):
-        now = seconds or 0.0
-        if now < last:  # a resumed run's clock begins anew
-            before += last
-        last = now
-        if mean is not None:
-            found.append(Evaluation(step, expert or 0, mean, (before + now) / 3600))
-    return found
+    """A run's evaluations but those in which every episode failed."""
+    record = Record.read(run, root=run.parent)
+    hours, experts = record.hours(), dict(zip(record.steps, record.column("expert_env_steps"), strict=True))
+    return [
+        Evaluation(step, int(experts[step] or 0), mean, hours.get(step, 0.0)) for step, mean in record.curve.items()
+    ]
 
 
 def write_figure(name: str, panels: Sequence[Curves | Errors], out: Path, *, as_hours: bool = False) -> list[str]:
