@@ -5,13 +5,10 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
 import pytest
@@ -57,33 +54,9 @@ def rows(run: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
-def worker_of(run: Path) -> int:
-    """The process that holds a run's lock."""
-    lock = str((run / "lock").resolve())
-    for process in Path("/proc").iterdir():
-        if process.name.isdigit():
-            try:
-                held = {os.readlink(file) for file in (process / "fd").iterdir()}
-            except OSError:
-                continue
-            if lock in held:
-                return int(process.name)
-    raise AssertionError(f"nobody holds {lock}")
-
-
-def kill_in_the_middle(run: Path, killed: list[int]) -> None:
-    """Kill a run's worker when it has a checkpoint and is not near its end."""
-    while not max((row["env_steps"] for row in rows(run)), default=0) >= 500:
-        time.sleep(0.02)
-    killed.append(worker_of(run))
-    os.kill(killed[0], signal.SIGKILL)
-
-
-def test_a_killed_worker_costs_nothing_but_time(cluster: str, tmp_path: Path) -> None:
+def test_a_killed_worker_costs_nothing_but_time(cluster: str, kill_in_the_middle: Any, tmp_path: Path) -> None:
     works = [Training(CONFIG, (seed,), tmp_path / "ray" / "Pendulum-v1" / "td3") for seed in range(3)]
-    killed: list[int] = []
-    killer = Thread(target=kill_in_the_middle, args=(works[0].out / "seed-0", killed), daemon=True)
-    killer.start()
+    killed = kill_in_the_middle(works[0].out / "seed-0", 500)
     said: list[str] = []
     failures = launch(works, Ray(cluster), logs=tmp_path / "logs", say=said.append)
     assert killed and failures == {} and all(work.finished() for work in works)

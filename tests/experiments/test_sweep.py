@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import csv
-import os
-import signal
-import time
+import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
 import pytest
@@ -164,29 +161,13 @@ def test_without_a_completed_trial_there_is_nothing_to_say(here: None, tmp_path:
 
 @extras
 @pytest.mark.timeout(300)
-def test_workers_that_are_killed_leave_every_trial_done_once(tmp_path: Path) -> None:
+def test_workers_that_are_killed_leave_every_trial_done_once(kill_in_the_middle: Any, tmp_path: Path) -> None:
     schedule = Schedule(steps=1500, evaluate_every=500, evaluation_episodes=1, log_every=100, checkpoint_every=100)
     config = RunConfig(
         "Pendulum-v1", td3.Config(width=8, batch_size=8, random_steps=100, updates_per_step=0.1), schedule
     )
     works = [Trial(number, config, (Search("batch_size", 2, 9),), (0,), False, tmp_path) for number in range(3)]
-    killed: list[int] = []
-
-    def kill() -> None:
-        run = works[0].folder / "seed-0"
-        while not (run / "checkpoints" / "000000300").is_dir():
-            time.sleep(0.02)
-        for process in Path("/proc").iterdir():
-            if process.name.isdigit() and process.name != str(os.getpid()):
-                try:
-                    held = {os.readlink(file) for file in (process / "fd").iterdir()}
-                except OSError:
-                    continue
-                if str((run / "lock").resolve()) in held:
-                    os.kill(int(process.name), signal.SIGKILL)
-                    killed.append(int(process.name))
-
-    Thread(target=kill, daemon=True).start()
+    killed = kill_in_the_middle(works[0].folder / "seed-0", 300)
     said: list[str] = []
     assert launch(works, Local(2), logs=tmp_path / "logs", say=said.append) == {}
     assert killed and "trial 0: its process died (SIGKILL); going on where it was" in said
@@ -197,6 +178,6 @@ def test_workers_that_are_killed_leave_every_trial_done_once(tmp_path: Path) -> 
 
 
 def test_without_optuna_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "optuna", None)
+    monkeypatch.setitem(sys.modules, "optuna", None)
     with pytest.raises(UserError, match=r"needs Optuna, which is not installed: pip install 'mbdpg\[sweep\]'"):
         begin(tmp_path)
