@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass
 from typing import Literal
 
-from mbdpg.experiments.launch import Local, Ray
+from mbdpg.experiments.launch import Local, Ray, cores
 from mbdpg.interfaces import require
 
 
@@ -16,7 +16,7 @@ class Places:
 
     engine: Literal["local", "ray"] = "local"
     """Where runs are made: on this machine, or on a Ray cluster."""
-    workers: int = os.cpu_count() or 1
+    workers: int = len(cores()) or os.cpu_count() or 1
     """Runs at once on this machine; each has its share of the cores."""
     address: str | None = None
     """Of a Ray cluster whose nodes share the file system, as in 10.0.0.1:6379; by default one is begun here."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -51,4 +52,4 @@ def reproduce(args: list[str]) -> None:
 
     with Stop() as stop:
         reproduce_study(flags.study, flags.scale, out.absolute(), engine, seeds=flags.seeds, say=say, should_stop=stop)
-        stop.exit_if_asked(f"{program()} reproduce {' '.join(args)}")
+        stop.exit_if_asked(f"{program()} reproduce {shlex.join(args)}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -13,8 +14,9 @@ from mbdpg.cli.places import Places, engine_of
 from mbdpg.cli.train import default_folder, run_flags
 from mbdpg.experiments import presets
 from mbdpg.experiments.config import RunConfig
+from mbdpg.experiments.search import Search
 from mbdpg.experiments.stopping import Stop
-from mbdpg.experiments.sweep import Search, sweep as search_settings
+from mbdpg.experiments.sweep import sweep as search_settings
 from mbdpg.interfaces import require
 
 
@@ -71,4 +73,4 @@ def sweep(args: list[str]) -> None:
             should_stop=stop,
         )
         again = args if run.out else [*args, "--out", str(out)]
-        stop.exit_if_asked(f"{program()} sweep {' '.join(again)}")
+        stop.exit_if_asked(f"{program()} sweep {shlex.join(again)}")

@@ -9,6 +9,7 @@ import re
 import signal
 import socket
 import sys
+import time
 import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
@@ -92,6 +93,11 @@ def launch(
     return _on_ray(due, engine, logs, say, should_stop)
 
 
+def cores() -> list[int]:
+    """Those that this process may use; none where nobody says."""
+    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+
+
 def log_of(work: Work, logs: Path) -> Path:
     """The file that gets what a piece of work prints."""
     return logs / f"{re.sub(r'[^A-Za-z0-9.=-]+', '-', work.name)}.log"
@@ -103,11 +109,19 @@ class _Pool:
     def __init__(self, workers: int, logs: Path, say: Callable[[str], None]):
         self._logs, self._say = logs, say
         self._context = multiprocessing.get_context("spawn")  # JAX has threads of its own: never fork
-        cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-        self._free = [cores[slot::workers] or cores for slot in range(workers)]
+        self._free = [cores()[slot::workers] or cores() for slot in range(workers)]
         self._running: dict[BaseProcess, tuple[Work, list[int]]] = {}
 
     def run(self, works: Sequence[Work], should_stop: Callable[[], bool]) -> dict[str, str]:
+        try:
+            return self._run(works, should_stop)
+        finally:  # where an error ends it, its processes save and end too
+            for process in self._running:
+                process.terminate()
+            for process in self._running:
+                process.join()
+
+    def _run(self, works: Sequence[Work], should_stop: Callable[[], bool]) -> dict[str, str]:
         waiting, begun, failures, stopping = deque(works), Counter[str](), dict[str, str](), False
         while self._running or (waiting and not stopping):
             while waiting and self._free and not stopping:
@@ -142,7 +156,8 @@ class _Pool:
 
     def _start(self, work: Work, cores: list[int]) -> None:
         process = self._context.Process(target=_in_process, args=(work, cores, log_of(work, self._logs)))
-        with _environment(dict.fromkeys(THREADS, str(max(len(cores), 1)))):
+        own = dict.fromkeys(THREADS, str(max(len(cores), 1)))
+        with _environment(own | {"JAX_PLATFORMS": os.environ.get("JAX_PLATFORMS", "cpu")}):
             process.start()
         self._running[process] = (work, cores)
 
@@ -156,15 +171,16 @@ class _Pool:
 
 
 def _in_process(work: Work, cores: list[int], log: Path) -> None:
+    parent = os.getppid()
     with open(log, "a", encoding="utf-8") as file, Stop() as stop:
         for stream in (1, 2):
             os.dup2(file.fileno(), stream)
-        # Ctrl-C reaches every process of a terminal: the parent passes it on, once, as SIGTERM.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        # A signal for all of a terminal or of a group is the parent's to pass on, once: a second one would not wait.
+        os.setpgid(0, 0)
         if cores:
             os.sched_setaffinity(0, cores)  # before XLA counts them
         try:
-            work(stop)
+            work(lambda: stop() or os.getppid() != parent)
         except Exception as error:
             if not isinstance(error, UserError):
                 traceback.print_exc()
@@ -184,9 +200,12 @@ def _on_ray(
         require(not engine.gpus or ray.cluster_resources().get("GPU", 0) > 0, "--gpus, but the cluster has none")
         # A process of its own for each, as on one machine; Ray itself begins what died with it again.
         task = ray.remote(num_cpus=1, num_gpus=int(engine.gpus), max_calls=1, max_retries=ATTEMPTS - 1)(_as_task)
-        running = {task.remote(work, log_of(work, logs)): work for work in works}
+        stop_file = logs / f"stop-{os.getpid()}-{time.time_ns()}"
+        running = {task.remote(work, log_of(work, logs), stop_file): work for work in works}
         failures: dict[str, str] = {}
-        while running and not should_stop():
+        while running:
+            if should_stop() and not stop_file.exists():
+                stop_file.touch()  # what has not begun ends at once, what has saves first
             for reference in ray.wait(list(running), timeout=POLL_SECONDS)[0]:
                 work = running.pop(reference)
                 try:
@@ -195,21 +214,21 @@ def _on_ray(
                     problem = f"{type(error).__name__}: {str(error).splitlines()[0]}"
                 if problem:
                     failures[work.name] = problem
-                say(f"{work.name}: " + (f"failed, {problem}" if problem else "done"))
-        for reference in running:
-            ray.cancel(reference, force=True)  # each goes on from its last checkpoint another time
+                if problem or work.finished():
+                    say(f"{work.name}: " + (f"failed, {problem}" if problem else "done"))
+        stop_file.unlink(missing_ok=True)
         return failures
     finally:
         ray.shutdown()
 
 
-def _as_task(work: Work, log: Path) -> str | None:
+def _as_task(work: Work, log: Path, stop_file: Path) -> str | None:
     """Do it, in a worker of Ray's; returns why it failed, if it did."""
     if work.finished():  # by an attempt whose worker died afterwards
         return None
     with open(log, "a", encoding="utf-8") as file, contextlib.redirect_stdout(file), contextlib.redirect_stderr(file):
         try:
-            work(lambda: False)
+            work(stop_file.exists)
         except Exception as error:
             traceback.print_exc()
             return str(error)
@@ -223,7 +242,9 @@ def _connected(address: str | None) -> Any:
     except ImportError as error:
         raise UserError("--engine ray needs Ray, which is not installed: pip install 'mbdpg[ray]'") from error
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     if address is None:  # Ray's own servers know no passwords: this one is for this machine alone
+        address = "local"
         options |= {"include_dashboard": False, "_node_ip_address": "127.0.0.1"}
     elif re.fullmatch(r"[^/]+:[0-9]{1,5}", address):
         host, port = address.rsplit(":", 1)
@@ -235,6 +256,8 @@ def _connected(address: str | None) -> Any:
         ray.init(address=address, **options)
     except (ConnectionError, ValueError, RuntimeError) as error:
         raise UserError(f"--address is {address}, where no Ray cluster answers: {error}") from error
+    for number, handler in handlers.items():  # of which Ray took one
+        signal.signal(number, handler)
     return ray
 
 
@@ -254,5 +277,5 @@ def _environment(values: dict[str, str]) -> Iterator[None]:
 
 
 def _last_line(log: Path) -> str:
-    lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
+    lines = log.read_text(encoding="utf-8", errors="replace").splitlines() if log.is_file() else []
     return next((line.removeprefix("mbdpg: ") for line in reversed(lines) if line.strip()), "")

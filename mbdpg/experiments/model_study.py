@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from mbdpg.dynamics.aggregation import Aggregate, Aggregation
 from mbdpg.dynamics.fitting import open_loop_error
 from mbdpg.experiments.compilations import keep_compilations
 from mbdpg.experiments.config import RunConfig
+from mbdpg.experiments.work import made_as, say_made_as, steps_evaluated
 from mbdpg.interfaces import Batch, Sampling, require
 from mbdpg.storage.checkpoint import load_checkpoint
 from mbdpg.storage.files import replace_durably
@@ -53,6 +55,8 @@ class ModelFit:
     """Of the dynamics, for every member."""
     data: Path
     """Run folder whose steps are learned from."""
+    data_steps: int
+    """That it must have."""
     seed: int
     out: Path
     """CSV file: depth, root mean square error, and that of persistence, in standard deviations of the observation."""
@@ -65,19 +69,25 @@ class ModelFit:
         return f"{self.label} seed {self.seed}"
 
     def finished(self) -> bool:
-        """Whether its errors are known."""
-        return self.out.exists()
+        """Whether its errors are known.
+
+        Raises:
+            UserError: those that are there are of other settings.
+        """
+        return made_as(self.out, self._settings())
 
     def __call__(self, should_stop: Callable[[], bool]) -> None:
         """Do it; stopped, it leaves nothing behind: it takes minutes."""
         keep_compilations()
+        there = steps_evaluated(self.data)
+        require(there >= self.data_steps, f"{self.data} has {there:,} of {self.data_steps:,} steps to learn from yet")
         config, steps = RunConfig.from_json(RunFolder.open(self.data).config), Recorded.load(self.data)
         env = config.make_env()
         agent, rng = MBDPG(self.agent, env.spec), np.random.default_rng(self.seed)
         env.close()
         members: list[Any] = []
         for member in range(self.members):
-            learner = Learner(agent, [1000 * self.seed + member])
+            learner = Learner(agent, [(1000 * self.seed + member) % 2**31])
             learner.prepare([steps.replay.statistics(0.0)])
             if self.aggregation == "boosting":
                 learner.state = _boosted(agent, learner.state, members)
@@ -95,12 +105,16 @@ class ModelFit:
         model = members[0] if self.aggregation == "none" else Aggregate(tuple(members), self.aggregation)
         self._write(errors(agent, model, state, steps))
 
+    def _settings(self) -> dict[str, Any]:
+        given = {name: getattr(self, name) for name in ("updates", "data_steps", "seed", "aggregation", "members")}
+        return given | {"agent": dataclasses.asdict(self.agent), "open_loop_steps": STEPS, "windows": WINDOWS}
+
     def _write(self, found: np.ndarray) -> None:
         text = io.StringIO()
         rows = csv.writer(text, lineterminator="\n")
         rows.writerow(["depth", "rmse", "persistence"])
         rows.writerows([depth, f"{error:.5g}", f"{still:.5g}"] for depth, (error, still) in enumerate(found, start=1))
-        self.out.parent.mkdir(parents=True, exist_ok=True)
+        say_made_as(self.out, self._settings())
         replace_durably(self.out, text.getvalue().encode())
 
 

@@ -13,8 +13,9 @@ from mbdpg.experiments.launch import Local, Ray, Work, launch
 from mbdpg.experiments.model_study import ModelFit
 from mbdpg.experiments.studies import RECORDED, SCALES, Cell, Model, Scale, ScaleName, Study, StudyName, study
 from mbdpg.experiments.work import Demonstrating, Training
-from mbdpg.interfaces import UserError
+from mbdpg.interfaces import require
 from mbdpg.reports.figures import Curves, Errors, write_figure
+from mbdpg.storage.run_folder import only_writer
 
 
 def reproduce(
@@ -48,18 +49,18 @@ def reproduce(
     together = isinstance(engine, Ray) and engine.gpus
     groups = [scale.seeds] if together else [(seed,) for seed in scale.seeds]
     first, then = _works(chosen, scale, groups, out)
+    say(f"{name}: the paper says: {chosen.claim}")
     failures: dict[str, str] = {}
-    for works in (first, then):
-        due = [work for work in works if not work.finished()]
-        say(f"{name}: {len(due)} of {len(works)} to do" if works else f"{name}: nothing to prepare")
-        failures |= launch(due, engine, logs=out / "logs", say=say, should_stop=should_stop)
-        if should_stop():
-            return
-    _draw(chosen, scale, out, say)
-    if failures:
-        raise UserError(
-            f"{len(failures)} of {len(first) + len(then)} failed (see {out / 'logs'}); the figure lacks them"
-        )
+    with only_writer(out):
+        for works in (first, then):
+            due = sum(not work.finished() for work in works)
+            say(f"{name}: {due} of {len(works)} to do" if works else f"{name}: nothing to prepare")
+            failures |= launch(works, engine, logs=out / "logs", say=say, should_stop=should_stop)
+            if should_stop():
+                return
+        _draw(chosen, scale, out, say)
+    logs, count = out / "logs", len(first) + len(then)
+    require(not failures, f"{len(failures)} of {count} failed (see {logs}); the figure lacks them")
 
 
 def _works(chosen: Study, scale: Scale, groups: Sequence[tuple[int, ...]], out: Path) -> tuple[list[Work], list[Work]]:
@@ -84,7 +85,8 @@ def _works(chosen: Study, scale: Scale, groups: Sequence[tuple[int, ...]], out: 
             for seed in scale.seeds:
                 file = _errors_file(model, seed, out)
                 data = recorded.out / "seed-0"
-                fitting = (model.agent, scale.model_updates, data, seed, file, model.aggregation, model.members)
+                given = (model.agent, scale.model_updates, data, scale.recorded_steps, seed, file)
+                fitting = (*given, model.aggregation, model.members)
                 add(then, ModelFit(model.label, *fitting))
     return list(first.values()), list(then.values())
 
@@ -96,7 +98,8 @@ def _training(cell: Cell, seeds: tuple[int, ...], scale: Scale, out: Path) -> Tr
 
 def _demonstrating(cell: Cell, scale: Scale, out: Path) -> Demonstrating:
     teacher = _teacher(cell.config, scale.expert_steps, scale)
-    return Demonstrating(teacher, scale.success_return, out / cell.config.env)
+    success = expert.success_in(teacher.env, teacher.env_options, None)
+    return Demonstrating(teacher, scale.success_share * success, out / cell.config.env)
 
 
 def _teacher(like: RunConfig, steps: int, scale: Scale) -> RunConfig:

@@ -6,22 +6,23 @@ import csv
 import dataclasses
 import io
 import json
-import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, final, get_args, get_origin, get_type_hints
+from typing import Any, Literal, final
 
 import numpy as np
 from matplotlib import pyplot as plt
 
 from mbdpg.experiments.config import RunConfig
 from mbdpg.experiments.launch import Local, Ray, launch
+from mbdpg.experiments.search import Search
 from mbdpg.experiments.work import Training
 from mbdpg.interfaces import UserError, flag_of, require
 from mbdpg.reports.record import learning_curve
 from mbdpg.storage.files import DamagedFileError, parse_object, read_checked, replace_durably
+from mbdpg.storage.run_folder import only_writer
 from mbdpg.training.loop import Update
 
 JOURNAL, NAME = "journal.log", "sweep"
@@ -30,77 +31,6 @@ LAST = 3
 """Evaluations whose mean is a trial's score: a single one is noisy."""
 
 State = Literal["running", "complete", "pruned", "failed"]
-
-
-@final
-@dataclass(frozen=True)
-class Search:
-    """The values that one setting may take: a range of numbers, or some choices."""
-
-    name: str
-    low: float = 0.0
-    high: float = 0.0
-    log: bool = False
-    choices: tuple[str, ...] = ()
-
-    @classmethod
-    def parse(cls, text: str, agent: Any) -> Search:
-        """Read `horizon=1:20`, `actor-learning-rate=1e-5:1e-3:log` or `gradient=full,eq19`.
-
-        Raises:
-            UserError: it is none of these, or the agent has no such setting.
-        """
-        name, equals, values = text.partition("=")
-        name = name.removeprefix("--").replace("-", "_")
-        known = {field.name for field in dataclasses.fields(agent)}
-        require(name in known, f"--search {text}: there is no {flag_of(name)}; expected a setting of the algorithm")
-        low, colon, rest = values.partition(":")
-        if not colon:
-            choices = tuple(part for part in values.split(",") if part)
-            require(bool(equals) and len(choices) > 1, f"--search {text}: expected {name}=LOW:HIGH or {name}=A,B,C")
-            for choice in choices:
-                _typed(choice, get_type_hints(type(agent))[name], text)
-            return cls(name, choices=choices)
-        kind = get_type_hints(type(agent))[name]
-        if kind not in (int, float):
-            names = ", ".join(map(str, get_args(kind))) or "true, false"
-            raise UserError(f"--search {text}: expected some of {names}, with commas between")
-        high, _, scale = rest.partition(":")
-        require(scale in ("", "log"), f"--search {text}: expected :log or nothing after the range")
-        try:
-            found = cls(name, float(low), float(high), scale == "log")
-        except ValueError as error:
-            raise UserError(f"--search {text}: expected numbers, {name}=LOW:HIGH") from error
-        ordered = math.isfinite(found.low) and math.isfinite(found.high) and found.low < found.high
-        require(ordered, f"--search {text}: expected a lower number before a higher one")
-        require(not found.log or found.low > 0, f"--search {text}: a logarithmic range begins above 0")
-        return found
-
-    def suggest(self, trial: Any, agent: Any) -> Any:
-        """This trial's value, of the setting's own type."""
-        kind = get_type_hints(type(agent))[self.name]
-        if self.choices:
-            return _typed(trial.suggest_categorical(self.name, list(self.choices)), kind, self.name)
-        if kind is int:
-            return trial.suggest_int(self.name, round(self.low), round(self.high), log=self.log)
-        return trial.suggest_float(self.name, self.low, self.high, log=self.log)
-
-
-def _typed(choice: str, kind: Any, text: str) -> Any:
-    """A choice as the setting's type has it."""
-    if get_origin(kind) is Literal:
-        known = {str(value): value for value in get_args(kind)}
-        expected = f"some of {', '.join(known)}, with commas between"
-    elif kind is bool:
-        known, expected = {"true": True, "false": False}, "true,false"
-    else:
-        try:
-            return kind(choice)
-        except ValueError as error:
-            numbers = "whole numbers" if kind is int else "numbers"
-            raise UserError(f"--search {text}: expected {numbers}, not {choice}") from error
-    require(choice in known, f"--search {text}: expected {expected}")
-    return known[choice]
 
 
 @final
@@ -142,8 +72,13 @@ class Trial:
 
     def __call__(self, should_stop: Callable[[], bool]) -> None:
         """Begin, or go on with the same settings where it was."""
-        study = opened(self.out, self.number)
+        # The first evaluation with anything learned says little yet.
+        study = opened(self.out, self.number, self.config.agent.random_steps + self.config.schedule.evaluate_every)
         trial = self._begun(study)
+        if study.trials[trial.number].state.is_finished():  # told, but its process died before it wrote the note
+            ended = study.trials[trial.number].state.name
+            state: State = "complete" if ended == "COMPLETE" else "pruned" if ended == "PRUNED" else "failed"
+            return self._write(trial.number, self.note()["settings"], state)
         values = {search.name: search.suggest(trial, self.config.agent) for search in self.searches}
         self._write(trial.number, values, "running")
         try:
@@ -209,11 +144,13 @@ def sweep(
     same = not kept.exists() or kept.read_text(encoding="utf-8") == plan
     require(same, f"{out} is of another sweep; go on with its own flags, or choose another --out")
     out.mkdir(parents=True, exist_ok=True)
-    replace_durably(kept, plan.encode())
     works = [Trial(number, config, tuple(searches), tuple(seeds), prune, out) for number in range(trials)]
-    failures = launch(works, engine, logs=out / "logs", say=say, should_stop=should_stop)
-    if not should_stop():
-        _conclude(works, out, say)
+    with only_writer(out):
+        if not kept.exists():
+            replace_durably(kept, plan.encode())
+        failures = launch(works, engine, logs=out / "logs", say=say, should_stop=should_stop)
+        if not should_stop():
+            _conclude(works, out, say)
     require(not failures, f"{len(failures)} of {trials} trials failed, see {out / 'logs'}")
 
 
@@ -229,7 +166,7 @@ def score(training: Training) -> float:
     return float(np.mean([*returns(training).values()][-LAST:]))
 
 
-def opened(out: Path, seed: int = 0) -> Any:
+def opened(out: Path, seed: int = 0, warm_up: int = 0) -> Any:
     """The study in a folder, kept in a journal that many processes may write to, as SQLite must not be."""
     optuna = _optuna()
     journal = optuna.storages.journal.JournalFileBackend(str(out / JOURNAL))
@@ -240,7 +177,7 @@ def opened(out: Path, seed: int = 0) -> Any:
         load_if_exists=True,
         # Trials that run at the same time shall not try the same.
         sampler=optuna.samplers.TPESampler(constant_liar=True, seed=seed),
-        pruner=optuna.pruners.MedianPruner(n_startup_trials=4),
+        pruner=optuna.pruners.MedianPruner(n_startup_trials=4, n_warmup_steps=warm_up),
     )
 
 

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-import shutil
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import final
+from typing import Any, final
 
 from mbdpg.experiments import expert
 from mbdpg.experiments.compilations import keep_compilations
 from mbdpg.experiments.config import RunConfig
 from mbdpg.experiments.run import OnUpdate, resume, train
 from mbdpg.interfaces import require
-from mbdpg.storage.run_folder import RunFolder
+from mbdpg.storage.files import replace_durably
+from mbdpg.storage.metrics import read_metrics
+from mbdpg.storage.run_folder import RunFolder, discard_unbegun
 
 
 @final
@@ -33,31 +35,34 @@ class Training:
         return f"{self.out.parent.name} {self.out.name} seed {', '.join(map(str, self.seeds))}"
 
     def finished(self) -> bool:
-        """Whether every seed has all its steps, with these settings."""
-        return all(_steps_done(run) >= self.config.schedule.steps and _is_of(run, self.config) for run in self.runs())
+        """Whether every seed has all its steps and its last evaluation, with these settings."""
+        return all(
+            steps_evaluated(run) >= self.config.schedule.steps and _is_of(run, self.config) for run in self.runs()
+        )
 
     def __call__(self, should_stop: Callable[[], bool], on_update: OnUpdate = lambda update: None) -> None:
         """Begin, or go on where it was.
 
         Raises:
-            UserError: a run folder has other settings.
+            UserError: a run folder has other settings, or is none.
         """
         keep_compilations()
         for run in self.runs():
-            if run.exists() and _steps_done(run) < 0:
-                shutil.rmtree(run)  # its process died before there was anything to go on from
+            if run.exists() and not any((run / "checkpoints").glob("[0-9]*")):
+                discard_unbegun(run)
             if run.exists():
                 same = _is_of(run, self.config)
-                require(same, f"{run} has other settings than this study's; move it away, or choose another --out")
-                if _steps_done(run) < self.config.schedule.steps:
-                    resume(run, steps=self.config.schedule.steps, watch=lambda *_: on_update, should_stop=should_stop)
+                require(same, f"{run} has other settings than this one's; move it away, or choose another --out")
+                if steps_evaluated(run) < self.config.schedule.steps:
+                    steps = self.config.schedule.steps
+                    resume(run, steps=steps, watch=lambda *_: on_update, should_stop=should_stop)
         fresh = [seed for seed, run in zip(self.seeds, self.runs(), strict=True) if not run.exists()]
         if fresh and not should_stop():
             train(self.config, seeds=fresh, out=self.out, on_update=on_update, should_stop=should_stop)
 
     def begun(self) -> list[Path]:
         """Run folders with these settings that have something to show."""
-        return [run for run in self.runs() if _steps_done(run) > 0 and _is_of(run, self.config)]
+        return [run for run in self.runs() if steps_evaluated(run) > 0 and _is_of(run, self.config)]
 
     def runs(self) -> list[Path]:
         """All run folders, begun or not."""
@@ -70,8 +75,8 @@ class Demonstrating:
     """An expert's training, and its successful episodes in a file."""
 
     expert: RunConfig
-    success_return: float | None
-    """None for what the task is known to need."""
+    success_return: float
+    """Least return of a success."""
     out: Path
     """Folder of the task."""
 
@@ -86,8 +91,12 @@ class Demonstrating:
         return self.out / "demonstrations.safetensors"
 
     def finished(self) -> bool:
-        """Whether they are recorded."""
-        return self.file.exists()
+        """Whether they are recorded.
+
+        Raises:
+            UserError: those that are there were made otherwise.
+        """
+        return made_as(self.file, self._settings())
 
     def __call__(self, should_stop: Callable[[], bool]) -> None:
         """Train, then record."""
@@ -95,21 +104,56 @@ class Demonstrating:
         training(should_stop)
         if should_stop():
             return
-        success = expert.success_in(config.env, config.env_options, self.success_return)
-        found = expert.record_from(
-            training.out / "seed-0", config.env, config.env_options, episodes=10, success_return=success, seed=0
-        )
+        run, success = training.runs()[0], self.success_return
+        found = expert.record_from(run, config.env, config.env_options, episodes=10, success_return=success, seed=0)
+        say_made_as(self.file, self._settings())
         found.save(self.file)
 
+    def _settings(self) -> dict[str, Any]:
+        return {"expert": self.expert.to_json(), "success_return": self.success_return}
 
-def _steps_done(run: Path) -> int:
-    """Environment steps of a run's newest checkpoint, -1 without one."""
-    return max((int(path.name) for path in (run / "checkpoints").glob("[0-9]*") if path.name.isdigit()), default=-1)
+
+def made_as(file: Path, settings: Mapping[str, Any]) -> bool:
+    """Whether a file is there and was made with these settings, as the note beside it says.
+
+    Raises:
+        UserError: it was made with others, or nobody knows.
+    """
+    if not file.exists():
+        return False
+    note = _note(file)
+    same = note.is_file() and note.read_text(encoding="utf-8") == _as_text(settings)
+    require(same, f"{file} was made with other settings; move it away, or choose another --out")
+    return True
+
+
+def say_made_as(file: Path, settings: Mapping[str, Any]) -> None:
+    """Write the note that `made_as` reads, before the file itself."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    replace_durably(_note(file), _as_text(settings).encode())
+
+
+def steps_evaluated(run: Path) -> int:
+    """Environment steps at which a run was last evaluated, -1 if it was not.
+
+    Not those of its last checkpoint: a run that is stopped before its last evaluation has one of the same step.
+    """
+    return max(read_metrics(run, "eval")["env_steps"], default=-1) if (run / "metrics.jsonl").is_file() else -1
+
+
+def _note(file: Path) -> Path:
+    return file.with_name(f"{file.name}.settings.json")
+
+
+def _as_text(settings: Mapping[str, Any]) -> str:
+    return json.dumps(settings, indent=2, sort_keys=True)
 
 
 def _is_of(run: Path, config: RunConfig) -> bool:
-    """Whether a run folder is of this configuration; only its length may differ."""
+    """Whether a run folder is of this configuration; its length may differ, and the place of its demonstrations."""
     found = RunConfig.from_json(RunFolder.open(run).config)
+    if config.demonstrations and found.demonstrations:
+        found = dataclasses.replace(found, demonstrations=config.demonstrations)
     return (
         dataclasses.replace(config, schedule=dataclasses.replace(config.schedule, steps=found.schedule.steps)) == found
     )

@@ -180,7 +180,8 @@ def _draw_errors(axes: Any, panel: Errors) -> None:
     for number, (label, table) in enumerate(tables.items()):
         depth, errors = table[0, :, 0], table[:, :, 1]
         axes.plot(depth, errors.mean(axis=0), color=f"C{number}", label=f"{label} ({_seeds(table)})")
-        low, high = errors.mean(axis=0) - errors.std(axis=0), errors.mean(axis=0) + errors.std(axis=0)
+        mean, spread = errors.mean(axis=0), errors.std(axis=0, ddof=1) if len(errors) > 1 else 0.0
+        low, high = mean - spread, mean + spread
         axes.fill_between(depth, low, high, color=f"C{number}", alpha=0.2, linewidth=0)
     for table in [*tables.values()][:1]:
         axes.plot(table[0, :, 0], table[:, :, 2].mean(axis=0), color="gray", linestyle=":", label="no change at all")

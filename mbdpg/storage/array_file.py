@@ -13,7 +13,6 @@ import numpy as np
 from mbdpg.interfaces import UserError
 from mbdpg.storage.files import (
     MAX_FILE_BYTES,
-    TEMPORARY,
     DamagedFileError,
     parse_object,
     read_checked,
@@ -41,7 +40,6 @@ def write_array_file(path: Path, kind: str, arrays: Mapping[str, np.ndarray], fa
     data = pack({**arrays, _FACTS: np.frombuffer(text, np.uint8)})
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.with_name(TEMPORARY + path.name).unlink(missing_ok=True)  # of a process that was killed here
         replace_durably(path, data)
     except OSError as error:
         raise UserError(f"cannot write {path}: {error.strerror}; choose another place or make room") from error

@@ -58,6 +58,7 @@ def replace_durably(path: Path, data: bytes) -> None:
         OSError: as `write_durably`; `path` is then as it was.
     """
     temporary = path.with_name(TEMPORARY + path.name)
+    temporary.unlink(missing_ok=True)  # of a process that was killed here
     write_durably(temporary, data)
     try:
         os.replace(temporary, path)

@@ -112,11 +112,36 @@ class RunFolder:
         Raises:
             UserError: another process holds it (the text has its pid and host), or the folder cannot be locked.
         """
-        descriptor = _acquire(self.path / "lock")
-        try:
+        with only_writer(self.path):
             yield
-        finally:
-            os.close(descriptor)
+
+
+@contextlib.contextmanager
+def only_writer(folder: Path) -> Iterator[None]:
+    """Hold a folder's lock until the `with` block or the process ends, by whatever signal: the kernel gives it back.
+
+    Raises:
+        UserError: another process holds it, or the folder cannot be locked.
+    """
+    descriptor = _acquire(folder / "lock")
+    try:
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def discard_unbegun(path: Path) -> None:
+    """Delete a run folder whose process died before its first checkpoint, when there was nothing to go on from.
+
+    Raises:
+        UserError: it is no run folder, a process works in it, or it holds something that mbdpg did not write.
+    """
+    with RunFolder.open(path).locked():
+        strange = [entry.name for entry in path.iterdir() if entry.name.removeprefix(TEMPORARY) not in _CONTENTS]
+        strange += [entry.name for entry in (path / "checkpoints").glob("[0-9]*")]
+        if strange:
+            raise UserError(f"{path} has no checkpoint, but has {strange[0]!r}; move it away, or choose another --out")
+        shutil.rmtree(path)
 
 
 def describe_machine() -> dict[str, Any]:

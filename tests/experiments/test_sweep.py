@@ -14,7 +14,8 @@ from mbdpg.agents import mbdpg, td3
 from mbdpg.experiments import sweep as module
 from mbdpg.experiments.config import RunConfig
 from mbdpg.experiments.launch import Local, Work, launch
-from mbdpg.experiments.sweep import Search, Trial, sweep
+from mbdpg.experiments.search import Search
+from mbdpg.experiments.sweep import Trial, sweep
 from mbdpg.interfaces import UserError
 from mbdpg.storage.metrics import read_metrics
 from mbdpg.training.loop import Schedule

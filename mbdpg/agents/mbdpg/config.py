@@ -116,7 +116,8 @@ class Config:
             self.first_value == 0 or self.horizon > 0,
             f"--first-value is {self.first_value}, expected 0 where --horizon is 0: there is no later value",
         )
-        require(
-            self.terminal_value or self.horizon > 0,
-            "--horizon is 0, expected at least 1 without --terminal-value: there is nothing else to climb",
-        )
+        climbs = self.terminal_value or (self.horizon > 0 and min(self.beta, self.final_beta) > 0)
+        nothing = "without --terminal-value there is nothing to climb where --horizon, --beta or --final-beta is 0"
+        require(climbs, nothing)
+        given = f"--imagination-ratio is {self.imagination_ratio}, expected 0 where --horizon is 0"
+        require(self.horizon > 0 or self.imagination_ratio == 0, given)
