@@ -138,7 +138,11 @@ def steps_evaluated(run: Path) -> int:
 
     Not those of its last checkpoint: a run that is stopped before its last evaluation has one of the same step.
     """
-    return max(read_metrics(run, "eval")["env_steps"], default=-1) if (run / "metrics.jsonl").is_file() else -1
+    if not (run / "metrics.jsonl").is_file():
+        return -1
+    rows = read_metrics(run, "eval")  # and timings, which another process of the run may have written alone
+    faults = rows.get("eval/faults", [None] * len(rows["env_steps"]))
+    return max((step for step, known in zip(rows["env_steps"], faults, strict=True) if known is not None), default=-1)
 
 
 def _note(file: Path) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +27,8 @@ def recorded(monkeypatch: pytest.MonkeyPatch) -> Recorded:
     replay, rng = Replay(3, 1), np.random.default_rng(0)
     for length in LENGTHS:
         for step in range(length):
-            pair = rng.normal(size=(2, 3)).astype(np.float32)
-            replay.add(pair[0], rng.uniform(-1, 1, 1).astype(np.float32), 0.0, pair[1], False, step == length - 1)
+            before, action = rng.normal(size=3).astype(np.float32), rng.uniform(-1, 1, 1).astype(np.float32)
+            replay.add(before, action, 0.0, 0.5 * before + action, False, step == length - 1)
     saved = Checkpoint(0, {}, {}, replay.columns())
     monkeypatch.setattr(model_study, "load_checkpoint", lambda run: saved)
     return Recorded.load(Path("run"))
@@ -65,7 +66,11 @@ def test_a_fit_leaves_the_errors_of_its_model(
     monkeypatch.setattr(model_study.RunFolder, "open", lambda path: config)
     monkeypatch.setattr(model_study.RunConfig, "from_json", lambda data: made())
     out = tmp_path / "models" / "seed-0.csv"
-    fit = ModelFit("m", SMALL, 3, Path("run"), 0, out, kind, count)
+    fit = ModelFit("m", SMALL, 3, Path("run"), 100, 0, out, kind, count)
+    monkeypatch.setattr(model_study, "steps_evaluated", lambda run: 99)
+    with pytest.raises(UserError, match="run has 99 of 100 steps to learn from yet"):
+        fit(lambda: False)
+    monkeypatch.setattr(model_study, "steps_evaluated", lambda run: 100)
     assert not fit.finished()
     fit(lambda: True)
     assert not fit.finished()
@@ -73,3 +78,9 @@ def test_a_fit_leaves_the_errors_of_its_model(
     assert fit.finished() and out.read_text().startswith("depth,rmse,persistence\n1,")
     table = np.loadtxt(out, delimiter=",", skiprows=1)
     assert table.shape == (6, 3) and list(table[:, 0]) == [1, 2, 3, 4, 5, 6] and np.isfinite(table).all()
+    longer = dataclasses.replace(fit, updates=600, out=tmp_path / "longer.csv")
+    longer(lambda: False)
+    learned = np.loadtxt(longer.out, delimiter=",", skiprows=1)
+    assert (learned[:, 2] == table[:, 2]).all() and learned[0, 1] < min(0.9 * learned[0, 2], table[0, 1])
+    with pytest.raises(UserError, match=r"seed-0.csv was made with other settings"):
+        dataclasses.replace(fit, updates=4).finished()

@@ -14,10 +14,12 @@ from mbdpg.agents import td3
 from mbdpg.experiments import reproduce as module
 from mbdpg.experiments.config import RunConfig
 from mbdpg.experiments.launch import Local, Work
-from mbdpg.experiments.reproduce import Training, reproduce
+from mbdpg.experiments.reproduce import reproduce
 from mbdpg.experiments.run import train
 from mbdpg.experiments.studies import SCALES, Cell, Panel, Study
+from mbdpg.experiments.work import Training, made_as, say_made_as
 from mbdpg.interfaces import UserError
+from mbdpg.storage.run_folder import RunFolder, only_writer
 from mbdpg.training.loop import Schedule
 
 SCHEDULE = Schedule(steps=40, cycle=10, evaluate_every=20, evaluation_episodes=1, log_every=20, checkpoint_every=20)
@@ -38,7 +40,7 @@ def launched(toy: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
 
     def launch(works: Sequence[Work], engine: Any, **others: Any) -> dict[str, str]:
         failures = {}
-        for work in works:
+        for work in (work for work in works if not work.finished()):
             done.append(work.name)
             try:
                 work(lambda: False)
@@ -67,9 +69,9 @@ def test_what_is_finished_is_skipped_and_what_was_begun_goes_on(launched: list[s
     half = dataclasses.replace(STUDY.panels[0].cells[0].config, schedule=dataclasses.replace(SCHEDULE, steps=20))
     (begun,) = train(half, seeds=[0], out=tmp_path / "Pendulum-v1" / "td3")
     first_rows = (begun / "metrics.jsonl").read_bytes()
-    empty = tmp_path / "Pendulum-v1" / "td3" / "seed-1"
-    empty.mkdir()  # a process died before it had anything to go on from
-    (empty / "config.json").write_text("{}")
+    # A process died before it had anything to go on from.
+    empty = RunFolder.create(tmp_path / "Pendulum-v1" / "td3" / "seed-1", half.to_json() | {"seed": 1})
+    (empty.path / "checkpoints").mkdir()
     said = begin(tmp_path)
     assert launched == [f"Pendulum-v1 {label} seed {seed}" for label in ("td3", "td3-width=5") for seed in (0, 1)]
     assert (begun / "metrics.jsonl").read_bytes().startswith(first_rows)
@@ -94,7 +96,7 @@ def test_a_run_with_other_settings_is_not_taken_for_the_studys(launched: list[st
         begin(tmp_path, seeds=[0])
     assert {row["label"] for row in numbers(tmp_path)} == {"td3 width=5"}
     work = Training(STUDY.panels[0].cells[0].config, (0,), tmp_path / "Pendulum-v1" / "td3")
-    with pytest.raises(UserError, match="has other settings than this study's; move it away"):
+    with pytest.raises(UserError, match="has other settings than this one's; move it away"):
         work(lambda: False)
 
 
@@ -103,10 +105,60 @@ def test_an_expert_without_success_fails_alone(launched: list[str], tmp_path: Pa
     study = dataclasses.replace(STUDY, panels=(Panel("demonstrations", (cell("td3"), taught)),))
     monkeypatch.setattr(module, "study", lambda name, scale: study)
     scale = dataclasses.replace(
-        SCALES["smoke"], expert_steps=100, success_return=1e6, tiny={"width": 4, "batch_size": 4, "random_steps": 50}
+        SCALES["smoke"], expert_steps=100, success_share=1.0, tiny={"width": 4, "batch_size": 4, "random_steps": 50}
     )
+    monkeypatch.setattr(module.expert, "success_in", lambda env, options, given: 1e6)
     monkeypatch.setitem(SCALES, "quick", scale)
     with pytest.raises(UserError, match="2 of 3 failed"):
         begin(tmp_path, seeds=[0])
     assert launched[0] == "Pendulum-v1 expert"
     assert {row["label"] for row in numbers(tmp_path)} == {"td3"}
+
+
+def test_a_folder_that_is_no_run_is_never_deleted(launched: list[str], tmp_path: Path) -> None:
+    seed = tmp_path / "td3" / "seed-0"
+    seed.mkdir(parents=True)
+    (seed / "thesis.txt").write_text("years of work")
+    work = Training(STUDY.panels[0].cells[0].config, (0,), tmp_path / "td3")
+    with pytest.raises(UserError, match="is not a run folder"):
+        work(lambda: False)
+    run = RunFolder.create(tmp_path / "other" / "seed-0", work.config.to_json() | {"seed": 0})
+    (run.path / "thesis.txt").write_text("years of work")
+    with pytest.raises(UserError, match="has no checkpoint, but has 'thesis.txt'; move it away"):
+        dataclasses.replace(work, out=tmp_path / "other")(lambda: False)
+    assert (seed / "thesis.txt").exists() and (run.path / "thesis.txt").exists()
+
+
+def test_a_run_that_another_process_begins_is_left_alone(launched: list[str], tmp_path: Path) -> None:
+    work = Training(STUDY.panels[0].cells[0].config, (0,), tmp_path / "td3")
+    run = RunFolder.create(tmp_path / "td3" / "seed-0", work.config.to_json() | {"seed": 0})
+    with run.locked(), pytest.raises(UserError, match="seed-0 is in use by pid"):
+        work(lambda: False)
+    assert (run.path / "config.json").exists()
+
+
+def test_a_run_without_its_last_evaluation_is_not_finished(launched: list[str], tmp_path: Path) -> None:
+    """A stop in the last cycle leaves a checkpoint of the last step."""
+    work = Training(STUDY.panels[0].cells[0].config, (0,), tmp_path / "td3")
+    work(lambda: False)
+    assert work.finished()
+    metrics = work.runs()[0] / "metrics.jsonl"
+    rows = metrics.read_bytes().splitlines(keepends=True)
+    metrics.write_bytes(b"".join(row for row in rows if b'"eval", "env_steps": 40' not in row))
+    assert not work.finished()
+
+
+def test_a_second_reproduce_in_the_same_folder_is_refused(launched: list[str], tmp_path: Path) -> None:
+    with only_writer(tmp_path), pytest.raises(UserError, match="is in use by pid .*; stop it or choose another --out"):
+        begin(tmp_path)
+    assert launched == []
+
+
+def test_demonstrations_and_errors_of_another_scale_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "seed-0.csv"
+    say_made_as(file, {"updates": 20})
+    assert not made_as(file, {"updates": 20})
+    file.write_text("depth")
+    assert made_as(file, {"updates": 20})
+    with pytest.raises(UserError, match="seed-0.csv was made with other settings; move it away"):
+        made_as(file, {"updates": 3000})

@@ -62,11 +62,13 @@ def test_a_search_gives_values_of_the_settings_own_type(text: str, value: Any) -
         ("horizon", "expected horizon=LOW:HIGH or horizon=A,B,C"),
         ("horizon=5", "expected horizon=LOW:HIGH or horizon=A,B,C"),
         ("horizon=a:b", "expected numbers, horizon=LOW:HIGH"),
-        ("horizon=5:1", "expected a lower number before a higher one"),
+        ("discount=1:0.5", "expected a lower number before a higher one"),
         ("discount=0:1:log", "a logarithmic range begins above 0"),
         ("discount=0.9:1:exp", "expected :log or nothing after the range"),
         ("discount=0:inf", "expected a lower number before a higher one"),
         ("horizon=1.5,2", "expected whole numbers"),
+        ("horizon=2.6:2.9", "expected two whole numbers, a lower one before a higher one"),
+        ("terminal-value=true,true", "expected terminal_value=LOW:HIGH or terminal_value=A,B,C"),
         ("gradient=1:2", "expected some of full, eq19, with commas between"),
         ("gradient=full,half", "expected some of full, eq19, with commas between"),
         ("trace=low,high", "expected numbers"),
@@ -140,10 +142,30 @@ def test_a_trial_that_was_stopped_goes_on_with_the_same_settings(here: None, tmp
 
 
 @extras
+def test_a_trial_that_was_told_but_not_noted_is_not_told_again(here: None, tmp_path: Path, monkeypatch: Any) -> None:
+    (tmp_path / "sweep").mkdir()
+    trial = Trial(0, CONFIG, tuple(SEARCHES), (0,), False, tmp_path / "sweep")
+    write = Trial._write
+
+    def dies(self: Trial, number: int, values: Any, state: Any) -> None:
+        if state == "complete":
+            raise KeyboardInterrupt
+        write(self, number, values, state)
+
+    monkeypatch.setattr(Trial, "_write", dies)
+    with pytest.raises(KeyboardInterrupt):
+        trial(lambda: False)
+    monkeypatch.setattr(Trial, "_write", write)
+    assert trial.note()["state"] == "running"
+    trial(lambda: False)
+    assert trial.note()["state"] == "complete" and len(module.opened(trial.out).trials) == 1
+
+
+@extras
 def test_bad_trials_are_given_up_and_impossible_ones_passed_over(
     here: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "returns", lambda training: {0: 0.0, 20: -float(training.out.name[-3:])})
+    monkeypatch.setattr(module, "returns", lambda training: {0: 0.0, 50: -float(training.out.name[-3:])})
     begin(tmp_path / "pruned", trials=6, prune=True)
     states = [row["state"] for row in table(tmp_path / "pruned")]
     assert states[:4] == ["complete"] * 4 and set(states[4:]) == {"pruned"}
