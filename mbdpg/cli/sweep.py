@@ -35,7 +35,7 @@ class SweepOptions:
     seeds: tuple[int, ...] = (0,)
     """Random seeds of every trial, in one process; their mean counts."""
     prune: bool = True
-    """Give a trial up that is worse at a step than the median of the others was."""
+    """Give a trial up whose best evaluation so far is below the median of completed trials at that step."""
     out: Path | None = None
     """Folder of the sweep; by default sweeps/ENV-ALGORITHM-TIME. A sweep goes on where it was."""
     places: tyro.conf.OmitArgPrefixes[Places] = field(default_factory=Places)

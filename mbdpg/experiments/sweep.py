@@ -45,7 +45,7 @@ class Trial:
     searches: tuple[Search, ...]
     seeds: tuple[int, ...]
     prune: bool
-    """Whether it is given up when it is worse than the median of the others at the same step."""
+    """Whether it is given up when its best so far is below the median of completed trials at the same step."""
     out: Path
     """Folder of the sweep."""
 

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import importlib
 import os
+import signal
+import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+import mbdpg
 from mbdpg.experiments.launch import ATTEMPTS, Local, Ray, launch
 from mbdpg.interfaces import UserError
 
@@ -96,6 +100,43 @@ def test_asked_to_stop_it_lets_each_piece_save(piece: Any, tmp_path: Path) -> No
     assert failures == {} and time.monotonic() - began < 60
     assert (tmp_path / "long").read_text() == "saved"
     assert works[1].count() == 0
+
+
+LAUNCHER = """
+import sys
+from pathlib import Path
+from mbdpg.experiments.launch import Local, launch
+from mbdpg.experiments.stopping import Stop
+from pieces_of_work import Piece
+
+if __name__ == "__main__":
+    folder = Path(sys.argv[1])
+    with Stop() as stop:
+        launch([Piece("long", folder, "endless")], Local(1), logs=folder / "logs", say=print, should_stop=stop)
+"""
+
+
+@pytest.mark.parametrize("how", ["all of its group are asked to end", "it is killed"])
+def test_whatever_ends_the_launcher_its_pieces_save(piece: Any, tmp_path: Path, how: str) -> None:
+    (tmp_path / "launcher.py").write_text(LAUNCHER)
+    paths = os.pathsep.join([str(tmp_path), str(Path(mbdpg.__file__).parent.parent)])
+    command = [sys.executable, str(tmp_path / "launcher.py"), str(tmp_path)]
+    program = subprocess.Popen(command, env=os.environ | {"PYTHONPATH": paths}, start_new_session=True)
+    waited(lambda: piece("long").count() > 0)
+    if how == "it is killed":
+        program.kill()
+    else:
+        os.killpg(program.pid, signal.SIGTERM)
+    program.wait(timeout=60)
+    waited((tmp_path / "long").exists)
+    assert (tmp_path / "long").read_text() == "saved"
+
+
+def waited(until: Callable[[], bool]) -> None:
+    began = time.monotonic()
+    while not until():
+        assert time.monotonic() - began < 60
+        time.sleep(0.05)
 
 
 def test_no_worker_and_no_ray_are_said_in_one_line(monkeypatch: pytest.MonkeyPatch, piece: Any, tmp_path: Path) -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
-import os
+import socket
 import subprocess
 import sys
+import tempfile
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -28,25 +31,39 @@ SCHEDULE = Schedule(
 CONFIG = RunConfig("Pendulum-v1", td3.Config(width=8, batch_size=8, random_steps=100, updates_per_step=0.1), SCHEDULE)
 
 
-def ray_command(*arguments: str) -> None:
-    command = [str(Path(sys.executable).parent / "ray"), *arguments]
-    quiet = os.environ | {"RAY_DISABLE_IMPORT_WARNING": "1", "RAY_USAGE_STATS_ENABLED": "0"}
-    done = subprocess.run(command, env=quiet, capture_output=True, text=True, check=False, timeout=120)
-    assert done.returncode == 0, done.stdout + done.stderr
-
-
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[str]:
-    """The address of a head and a worker node on loopback, with a core each."""
-    address = "127.0.0.1:26379"
-    ray_command("stop", "--force")
-    node = ("--node-ip-address=127.0.0.1", "--num-cpus=1", "--disable-usage-stats")
-    try:
-        ray_command("start", "--head", f"--port={address.split(':')[1]}", "--include-dashboard=false", *node)
-        ray_command("start", f"--address={address}", *node)
-        yield address
-    finally:
-        ray_command("stop", "--force")
+    """The address of a head and a worker node on loopback, with a core each; other clusters are left alone."""
+    ray = str(Path(sys.executable).parent / "ray")
+    node = ("--block", "--node-ip-address=127.0.0.1", "--num-cpus=1", "--disable-usage-stats")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    address = f"127.0.0.1:{port}"
+    # Not pytest's own folder: the names of sockets may not be long.
+    with tempfile.TemporaryDirectory() as place, contextlib.ExitStack() as nodes:
+        begun = (
+            ("--head", f"--port={port}", "--include-dashboard=false", f"--temp-dir={place}"),
+            (f"--address={address}",),
+        )
+        for flags in begun:
+            process = subprocess.Popen(
+                [ray, "start", *flags, *node], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+            )
+            nodes.callback(process.wait, 60)
+            nodes.callback(process.terminate)
+        yield wait_for(address)
+
+
+def wait_for(address: str) -> str:
+    """The address, once two nodes have joined."""
+    state = "import ray, sys; ray.init(sys.argv[1], log_to_driver=False); print(len(ray.nodes()))"
+    for _ in range(20):
+        done = subprocess.run([sys.executable, "-c", state, address], capture_output=True, text=True, check=False)
+        if done.stdout.strip().endswith("2"):
+            return address
+        time.sleep(1)
+    raise AssertionError(done.stdout + done.stderr)
 
 
 def rows(run: Path) -> list[dict[str, Any]]:
@@ -69,6 +86,20 @@ def test_a_killed_worker_costs_nothing_but_time(cluster: str, kill_in_the_middle
         assert len(set(found)) == len(found) == len(rows(alone.out / "seed-0"))
     assert rows(works[0].out / "seed-0") == rows(alone.out / "seed-0")
     assert launch(works, Ray("127.0.0.1:1"), logs=tmp_path, say=said.append) == {}  # nothing is left to do
+
+
+def test_asked_to_stop_each_piece_saves_and_another_time_goes_on(cluster: str, tmp_path: Path) -> None:
+    work = Training(CONFIG, (0,), tmp_path / "Pendulum-v1" / "td3")
+    checkpoints = work.runs()[0] / "checkpoints"
+
+    def begun() -> bool:
+        return (checkpoints / "000000300").is_dir()
+
+    said: list[str] = []
+    assert launch([work], Ray(cluster), logs=tmp_path / "logs", say=said.append, should_stop=begun) == {}
+    assert not work.finished() and said == []
+    assert launch([work], Ray(cluster), logs=tmp_path / "logs", say=said.append) == {}
+    assert work.finished() and [path.name for path in (tmp_path / "logs").iterdir()] == ["Pendulum-v1-td3-seed-0.log"]
 
 
 def test_a_piece_that_raises_is_named_and_the_others_are_done(cluster: str, tmp_path: Path) -> None:
