@@ -160,10 +160,17 @@ def test_targets_follow_at_their_rate_at_every_update() -> None:
 
 
 @pytest.mark.parametrize(("share", "updates", "rate"), [(0.0, 999, 1.0), (1.0, 0, 1.0), (0.01, 1000, 1 / 11)])
+def test_averages_reach_back_over_a_share_of_the_updates(share: float, updates: int, rate: float) -> None:
+    old, new = jnp.asarray([1.0, 2.0]), jnp.asarray([3.0, -1.0])
+    found = agent((("average_share", share),))._average(old, new, jnp.int32(updates))
+    np.testing.assert_allclose(found, (1 - rate) * np.asarray(old) + rate * np.asarray(new), rtol=1e-6)
+
+
 @pytest.mark.parametrize("name", ["fit", "clone", "improve"])
-def test_averages_reach_back_over_a_share_of_the_updates(name: str, share: float, updates: int, rate: float) -> None:
-    before = eqx.tree_at(lambda x: (x.fits, x.updates), state(), (jnp.int32(updates),) * 2)
-    after, _ = update(name, (("average_share", share),))(before, BATCHES[name])
+def test_each_update_moves_the_average_of_what_it_learns(name: str) -> None:
+    before = eqx.tree_at(lambda x: (x.fits, x.updates), state(), (jnp.int32(1000),) * 2)
+    after, _ = update(name)(before, BATCHES[name])
+    rate = 1 / (1 + 1000 * agent().config.average_share)
     network = "dynamics" if name == "fit" else "actor"
     trees = (getattr(before, f"average_{network}"), getattr(after, f"average_{network}"), getattr(after, network))
     for old, new, followed in zip(*map(jax.tree.leaves, trees), strict=True):

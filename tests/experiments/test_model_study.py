@@ -57,7 +57,9 @@ def test_too_short_episodes_are_refused_in_one_line(recorded: Recorded, monkeypa
         Recorded.load(Path("run"))
 
 
-@pytest.mark.parametrize(("kind", "count"), [("none", 1), ("bagging", 2), ("boosting", 2)])
+@pytest.mark.parametrize(
+    ("kind", "count"), [("none", 1), pytest.param("bagging", 2, marks=pytest.mark.slow), ("boosting", 2)]
+)
 def test_a_fit_leaves_the_errors_of_its_model(
     recorded: Recorded, kind: Any, count: int, tmp_path: Path, monkeypatch: Any
 ) -> None:
