@@ -217,6 +217,10 @@ def test_without_a_horizon_nothing_depends_on_the_model(differences: Callable[..
     once, other = (update("improve", settings)(before, BATCHES["improve"])[0] for before in (state(), elsewhere))
     assert differences(once, other) == {"average_dynamics"}
     assert differences(state(), once) == MOVES["improve"]
+    one = agent(settings)
+    windows = jax.tree.map(jnp.asarray, batch(one.diagnosis.burn_in + one.diagnosis.length))
+    found = jax.eval_shape(lambda s: one.diagnose(s, windows, jnp.zeros(BATCH)), state())
+    assert set(found) == {"critic/q_bias", "critic/realized_return"}
 
 
 def test_without_a_horizon_the_critics_target_is_td3s() -> None:

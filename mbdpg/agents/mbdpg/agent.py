@@ -291,4 +291,6 @@ class MBDPG:
     def diagnose(self, state: State, batch: Batch, realized_return: Array) -> Metrics:
         """Open-loop error, Q and survival against what happened, gradient norm per imagined depth."""
         window = self.normalized(state, batch)
-        return instruments.measure(self.config, state, window, realized_return)
+        metrics = instruments.measure(self.config, state, window, realized_return)
+        known = self.config.horizon > 0  # else the dynamics are never trained
+        return {name: value for name, value in metrics.items() if known or not name.startswith("dynamics/")}
