@@ -89,7 +89,8 @@ def test_a_killed_worker_costs_nothing_but_time(cluster: str, kill_in_the_middle
 
 
 def test_asked_to_stop_each_piece_saves_and_another_time_goes_on(cluster: str, tmp_path: Path) -> None:
-    work = Training(CONFIG, (0,), tmp_path / "Pendulum-v1" / "td3")
+    long = dataclasses.replace(CONFIG, schedule=dataclasses.replace(SCHEDULE, steps=20_000, checkpoint_every=300))
+    work = Training(long, (0,), tmp_path / "Pendulum-v1" / "td3")
     checkpoints = work.runs()[0] / "checkpoints"
 
     def begun() -> bool:
