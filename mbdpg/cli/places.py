@@ -1,4 +1,4 @@
-"""Flags of verbs that run many things: where they are run."""
+"""What verbs that run many things share: where they are run, and how they say what happens."""
 
 from __future__ import annotations
 
@@ -22,6 +22,11 @@ class Places:
     """Of a Ray cluster whose nodes share the file system, as in 10.0.0.1:6379; by default one is begun here."""
     gpus: bool = False
     """With Ray: a GPU for every piece of work, which trains all its seeds at once."""
+
+
+def say(line: str) -> None:
+    """Print a line of progress at once, whoever reads."""
+    print(line, flush=True)
 
 
 def engine_of(places: Places) -> Local | Ray:

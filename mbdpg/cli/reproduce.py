@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from mbdpg.cli.flags import parse, program
-from mbdpg.cli.places import Places, engine_of
+from mbdpg.cli.places import Places, engine_of, say
 from mbdpg.experiments.reproduce import reproduce as reproduce_study
 from mbdpg.experiments.stopping import Stop
 from mbdpg.experiments.studies import ScaleName, StudyName
@@ -46,9 +46,6 @@ def reproduce(args: list[str]) -> None:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"{out} cannot be a folder of studies ({error.strerror}); choose another --out") from error
-
-    def say(line: str) -> None:
-        print(line, flush=True)
 
     with Stop() as stop:
         reproduce_study(flags.study, flags.scale, out.absolute(), engine, seeds=flags.seeds, say=say, should_stop=stop)

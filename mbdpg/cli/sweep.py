@@ -5,15 +5,15 @@ from __future__ import annotations
 import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 
 from mbdpg.cli.flags import program
-from mbdpg.cli.places import Places, engine_of
+from mbdpg.cli.places import Places, engine_of, say
 from mbdpg.cli.train import default_folder, run_flags
 from mbdpg.experiments import presets
-from mbdpg.experiments.config import RunConfig
+from mbdpg.experiments.config import Algorithm, RunConfig
 from mbdpg.experiments.search import Search
 from mbdpg.experiments.stopping import Stop
 from mbdpg.experiments.sweep import sweep as search_settings
@@ -24,7 +24,7 @@ from mbdpg.interfaces import require
 class SweepOptions:
     """What is searched, and where."""
 
-    algorithm: Literal["mbdpg", "td3", "sac", "pets", "mbpo"] = "mbdpg"
+    algorithm: Algorithm = "mbdpg"
     """Algorithm to train."""
     preset: presets.Preset = "default"
     """Settings that measured best, or those published; other flags change single ones."""
@@ -56,9 +56,6 @@ def sweep(args: list[str]) -> None:
     require(len({search.name for search in searches}) == len(searches), "--search has a setting twice")
     out = (run.out or default_folder("sweeps", config)).absolute()
     config.make_env().close()  # a wrong task is better said once than by every trial
-
-    def say(line: str) -> None:
-        print(line, flush=True)
 
     with Stop() as stop:
         search_settings(

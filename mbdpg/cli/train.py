@@ -8,7 +8,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 
@@ -16,7 +16,7 @@ from mbdpg.cli.demonstrate import Demonstrate, make_demonstrations
 from mbdpg.cli.flags import EnvArgument, parse, peek, program
 from mbdpg.experiments import presets, run
 from mbdpg.experiments.compilations import keep_compilations
-from mbdpg.experiments.config import EnvOptions, RunConfig
+from mbdpg.experiments.config import Algorithm, EnvOptions, RunConfig
 from mbdpg.experiments.stopping import Stop
 from mbdpg.reports.console import RunDisplay
 from mbdpg.reports.curves import draw_curves
@@ -27,7 +27,7 @@ from mbdpg.training.loop import Schedule
 class RunOptions:
     """What is run."""
 
-    algorithm: Literal["mbdpg", "td3", "sac", "pets", "mbpo"] = "mbdpg"
+    algorithm: Algorithm = "mbdpg"
     """Algorithm to train."""
     preset: presets.Preset = "default"
     """Settings that measured best, or those published; other flags change single ones."""

@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from mbdpg import envs
 from mbdpg.agents import mbdpg, mbpo, pets, sac, td3
@@ -14,6 +14,8 @@ from mbdpg.interfaces import require
 from mbdpg.training.loop import Schedule
 
 AgentConfig = mbdpg.Config | td3.Config | sac.Config | pets.Config | mbpo.Config
+
+Algorithm = Literal["mbdpg", "td3", "sac", "pets", "mbpo"]
 
 CONFIGS: dict[str, type[AgentConfig]] = {
     "mbdpg": mbdpg.Config,

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +23,7 @@ from mbdpg.experiments.config import RunConfig
 from mbdpg.experiments.work import made_as, say_made_as, steps_evaluated
 from mbdpg.interfaces import Batch, Sampling, require
 from mbdpg.storage.checkpoint import load_checkpoint
-from mbdpg.storage.files import replace_durably
+from mbdpg.storage.files import replace_table
 from mbdpg.storage.run_folder import RunFolder
 from mbdpg.training.learner import Learner
 from mbdpg.training.replay import Replay
@@ -110,12 +108,9 @@ class ModelFit:
         return given | {"agent": dataclasses.asdict(self.agent), "open_loop_steps": STEPS, "windows": WINDOWS}
 
     def _write(self, found: np.ndarray) -> None:
-        text = io.StringIO()
-        rows = csv.writer(text, lineterminator="\n")
-        rows.writerow(["depth", "rmse", "persistence"])
-        rows.writerows([depth, f"{error:.5g}", f"{still:.5g}"] for depth, (error, still) in enumerate(found, start=1))
+        rows = [(depth, f"{error:.5g}", f"{still:.5g}") for depth, (error, still) in enumerate(found, start=1)]
         say_made_as(self.out, self._settings())
-        replace_durably(self.out, text.getvalue().encode())
+        replace_table(self.out, [("depth", "rmse", "persistence"), *rows])
 
 
 @final
@@ -177,5 +172,4 @@ def _boosted(agent: MBDPG, state: Any, before: list[Any]) -> Any:
         lambda s: (s.dynamics, s.average_dynamics, s.dynamics_optimizer),
         state,
         (dynamics, jax.tree.map(jnp.copy, dynamics), optimizer),
-        is_leaf=lambda x: x is None,
     )

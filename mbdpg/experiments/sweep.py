@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import io
 import json
@@ -21,7 +20,7 @@ from mbdpg.experiments.search import Search
 from mbdpg.experiments.work import Training
 from mbdpg.interfaces import UserError, flag_of, require
 from mbdpg.reports.record import learning_curve
-from mbdpg.storage.files import DamagedFileError, parse_object, read_checked, replace_durably
+from mbdpg.storage.files import DamagedFileError, parse_object, read_checked, replace_durably, replace_table
 from mbdpg.storage.run_folder import only_writer
 from mbdpg.training.loop import Update
 
@@ -188,14 +187,11 @@ def _conclude(works: Sequence[Trial], out: Path, say: Callable[[str], None]) -> 
     notes = [work.note() for work in works]
     values = {trial.number: trial.value for trial in done}
     names = [search.name for search in works[0].searches]
-    text = io.StringIO()
-    rows = csv.writer(text, lineterminator="\n")
-    rows.writerow(["trial", "state", "score", *names])
+    rows: list[Sequence[Any]] = [("trial", "state", "score", *names)]
     for number, note in enumerate(notes):
-        settings = note.get("settings", {})
-        score_ = values.get(note.get("trial"), "")
-        rows.writerow([number, note.get("state", "missing"), score_, *(settings.get(name, "") for name in names)])
-    replace_durably(out / "sweep.csv", text.getvalue().encode())
+        settings, score_ = note.get("settings", {}), values.get(note.get("trial"), "")
+        rows.append((number, note.get("state", "missing"), score_, *(settings.get(name, "") for name in names)))
+    replace_table(out / "sweep.csv", rows)
     say(f"{len(done)} of {len(works)} trials completed; all of them in {out / 'sweep.csv'}")
     best = max((note for note in notes if note.get("trial") in values), key=lambda note: values[note["trial"]])
     flags = " ".join(f"{flag_of(name)} {value}" for name, value in best["settings"].items())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 from collections.abc import Callable, Mapping, Sequence, Sized
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from matplotlib import pyplot as plt
 
 from mbdpg.reports.record import Record
 from mbdpg.reports.statistics import summarize
-from mbdpg.storage.files import replace_durably
+from mbdpg.storage.files import replace_durably, replace_table
 
 COLUMNS: tuple[Any, ...] = (
     *("panel", "label", "seed", "env_steps", "expert_env_steps", "return_mean", "hours"),
@@ -97,9 +96,7 @@ def write_figure(name: str, panels: Sequence[Curves | Errors], out: Path, *, as_
                     seed = path.stem.removeprefix("seed-")
                     rows += [(panel.title, label, seed, *[""] * 4, int(depth), *both) for depth, *both in own]
                 lines.append(f"  {label} ({_seeds(table)}): {_errors(table)}")
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    replace_durably(out / f"{name}.csv", text.getvalue().encode())
+    replace_table(out / f"{name}.csv", rows)
     if not as_hours:
         replace_durably(out / f"{name}.png", _picture(panels))
         lines.insert(1, f"figure in {out / f'{name}.png'}")

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import csv
 import hashlib
+import io
 import json
 import os
 import stat
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -65,6 +68,13 @@ def replace_durably(path: Path, data: bytes) -> None:
     except BaseException:
         _forget(temporary)
         raise
+
+
+def replace_table(path: Path, rows: Iterable[Sequence[Any]]) -> None:
+    """Write rows as CSV, as `replace_durably` does."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    replace_durably(path, text.getvalue().encode())
 
 
 def sync_folder(path: Path) -> None:
