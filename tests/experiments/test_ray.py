@@ -89,18 +89,22 @@ def test_a_killed_worker_costs_nothing_but_time(cluster: str, kill_in_the_middle
 
 
 def test_asked_to_stop_each_piece_saves_and_another_time_goes_on(cluster: str, tmp_path: Path) -> None:
-    long = dataclasses.replace(CONFIG, schedule=dataclasses.replace(SCHEDULE, steps=20_000, checkpoint_every=300))
-    work = Training(long, (0,), tmp_path / "Pendulum-v1" / "td3")
-    checkpoints = work.runs()[0] / "checkpoints"
-
-    def begun() -> bool:
-        return (checkpoints / "000000300").is_dir()
-
+    endless = dataclasses.replace(CONFIG, schedule=dataclasses.replace(SCHEDULE, steps=100_000_000))
+    work = Training(endless, (0,), tmp_path / "Pendulum-v1" / "td3")
     said: list[str] = []
-    assert launch([work], Ray(cluster), logs=tmp_path / "logs", say=said.append, should_stop=begun) == {}
-    assert not work.finished() and said == []
-    assert launch([work], Ray(cluster), logs=tmp_path / "logs", say=said.append) == {}
-    assert work.finished() and [path.name for path in (tmp_path / "logs").iterdir()] == ["Pendulum-v1-td3-seed-0.log"]
+
+    def saved() -> int:
+        return max((int(path.name) for path in work.runs()[0].glob("checkpoints/0*") if path.name.isdigit()), default=0)
+
+    reached = [0]
+    for _ in range(2):
+        more: Callable[[], bool] = lambda: saved() > reached[-1]  # noqa: E731
+        assert launch([work], Ray(cluster), logs=tmp_path / "logs", say=said.append, should_stop=more) == {}
+        reached.append(saved())
+    assert 0 < reached[1] < reached[2] and not work.finished() and said == []
+    steps = [row["env_steps"] for row in rows(work.runs()[0]) if row["kind"] == "eval"]
+    assert steps == sorted(set(steps))
+    assert [path.name for path in (tmp_path / "logs").iterdir()] == ["Pendulum-v1-td3-seed-0.log"]
 
 
 def test_a_piece_that_raises_is_named_and_the_others_are_done(cluster: str, tmp_path: Path) -> None:
