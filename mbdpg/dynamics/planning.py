@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from mbdpg.dynamics.ensemble import Ensemble, Units, predict
+from mbdpg.dynamics.ensemble import Ensemble, Step, Units, predict
 from mbdpg.dynamics.termination import RULES
 from mbdpg.networks.leaves import leaf_name
 
@@ -82,13 +82,18 @@ class Planner(eqx.Module):
     ) -> Float[Array, " plan"]:
         """Mean over members and particles of the discounted reward that each plan earns while it survives."""
         members, count = self.ensemble.members.output.bias.shape[0], plans.shape[0]
-        lead = (members, count * self.particles)
+        lead = (members, count, self.particles)
         start = jnp.broadcast_to(observation, (*lead, observation.shape[0]))
 
         def step(carry: tuple[Array, Array], inputs: tuple[Array, Array]) -> tuple[tuple[Array, Array], Array]:
             (state, alive), (action, key) = carry, inputs
-            action = jnp.broadcast_to(jnp.repeat(action, self.particles, axis=0), (*lead, action.shape[-1]))
-            imagined = predict(self.ensemble, self.units, state, action, key=key)
+            action = jnp.broadcast_to(action[None, :, None], (*lead, action.shape[-1]))
+
+            def go_on(state: Array, action: Array) -> Step:
+                return predict(self.ensemble, self.units, state, action, key=key)
+
+            # One key for all: the particles of every plan have the same luck, so that plans differ by what they do.
+            imagined = jax.vmap(go_on, in_axes=1, out_axes=1)(state, action)
             goes_on = imagined.continues
             if self.rule is not None:
                 goes_on = RULES[self.rule](imagined.next_observation).astype(jnp.float32)
@@ -97,8 +102,7 @@ class Planner(eqx.Module):
 
         inputs = (jnp.swapaxes(plans, 0, 1), jax.random.split(key, self.horizon))
         _, rewards = jax.lax.scan(step, (start, jnp.ones(lead)), inputs)
-        total = jnp.sum(rewards, axis=0).reshape(members, count, self.particles)
-        found = jnp.mean(total, axis=(0, 2))
+        found = jnp.mean(jnp.sum(rewards, axis=0), axis=(0, 2))
         # An imagined state that ran away must not win; to take the largest of it and a NaN would be a NaN.
         return jnp.where(jnp.isfinite(found), found, -jnp.inf)
 
@@ -106,7 +110,7 @@ class Planner(eqx.Module):
         self, observation: Float[Array, " observation"], before: Float[Array, "time action"], *, key: PRNGKeyArray
     ) -> Float[Array, "time action"]:
         """The best sequence found from a raw observation, beginning from another."""
-        # The same imagined noise in every iteration: plans are then compared by what they are.
+        # The same imagined noise in every iteration, so that an elite is one by what it does and not by its luck.
         noise_key, search_key = jax.random.split(key)
         return cross_entropy(
             lambda plans: self.imagined_return(observation, plans, key=noise_key),

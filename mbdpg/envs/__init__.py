@@ -1,7 +1,6 @@
 """Where Gymnasium ends: everything past this package sees `mbdpg.interfaces.Environment` alone."""
 
 from mbdpg.envs.make import (
-    OLD_IDS as OLD_IDS,
     MakeGymnasium as MakeGymnasium,
     episode_seed as episode_seed,
     make as make,

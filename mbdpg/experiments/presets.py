@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any, Literal, get_args
 
-from mbdpg.envs import OLD_IDS
 from mbdpg.experiments.config import CONFIGS, AgentConfig, EnvOptions
 from mbdpg.interfaces import require
 from mbdpg.training.loop import Schedule
@@ -58,27 +57,35 @@ PAPER: dict[str, dict[str, Any]] = {
     "mbpo": {"layers": 2, "plain": True, "random_steps": 5000, "updates_per_step": 20.0, "fits_per_step": 2.0},
 }
 
+MBPO_TASKS: dict[str, dict[str, Any]] = {
+    # jannerm/mbpo, examples/config.
+    "Hopper": {"final_rollout_length": 15, "entropy_per_action": -1 / 3},
+    "HalfCheetah": {"entropy_per_action": -0.5},
+    "Walker2d": {"entropy_per_action": -0.5},
+    "Ant": {"final_rollout_length": 25, "lengthen_until": 100_000, "entropy_per_action": -0.5},
+    # None is published: Hopper's rollouts.
+    "BipedalWalker": {"final_rollout_length": 15},
+    "LunarLanderContinuous": {"final_rollout_length": 15},
+}
+"""What MBPO takes for a task under both presets."""
+
+ORACLE = {"termination": "known"}
+"""Both authors knew where the simulator ends episodes."""
+
 TASKS: dict[str, dict[str, dict[str, dict[str, Any]]]] = {
-    # What a task wants otherwise than the default; each is one more thing to know, and has its numbers in the notebook.
+    # By the id without its version: what a task wants otherwise than the algorithm's other tasks. MBDPG's are each one
+    # more thing to know, and have their numbers in the notebook.
     "default": {
         "mbdpg": {
-            "LunarLanderContinuous-v3": {"trace": 1.0},  # 21: below 1 it hovers and never meets the ground
+            "LunarLanderContinuous": {"trace": 1.0},  # 21: below 1 it hovers and never meets the ground
         },
+        "mbpo": MBPO_TASKS,
     },
-    # What the authors set for the task (jannerm/mbpo, examples/config); both knew where the simulator ends episodes.
     "paper": {
-        "pets": {"HalfCheetah-v5": {"termination": "known"}},
-        "mbpo": {
-            "Hopper-v5": {"final_rollout_length": 15, "entropy_per_action": -1 / 3, "termination": "known"},
-            "HalfCheetah-v5": {"updates_per_step": 40.0, "entropy_per_action": -0.5, "termination": "known"},
-            "Walker2d-v5": {"entropy_per_action": -0.5, "termination": "known"},
-            "Ant-v5": {
-                "final_rollout_length": 25,
-                "lengthen_until": 100_000,
-                "entropy_per_action": -0.5,
-                "termination": "known",
-            },
-        },
+        "pets": {"HalfCheetah": ORACLE},
+        "mbpo": MBPO_TASKS
+        | {name: MBPO_TASKS[name] | ORACLE for name in ("Hopper", "Walker2d", "Ant")}
+        | {"HalfCheetah": MBPO_TASKS["HalfCheetah"] | ORACLE | {"updates_per_step": 40.0}},
     },
 }
 
@@ -91,7 +98,7 @@ def agent_config(algorithm: str, preset: str, env: str | None = None) -> AgentCo
     """The algorithm's settings under a preset, which has values of their own for some tasks."""
     require(algorithm in CONFIGS, f"unknown --algorithm {algorithm!r}; expected one of {', '.join(CONFIGS)}")
     require(preset in get_args(Preset), f"unknown --preset {preset!r}; expected {' or '.join(get_args(Preset))}")
-    own = TASKS[preset].get(algorithm, {}).get(OLD_IDS.get(env, env), {}) if env else {}
+    own = TASKS[preset].get(algorithm, {}).get(env.rpartition("-v")[0], {}) if env else {}
     return CONFIGS[algorithm](**((PAPER[algorithm] if preset == "paper" else {}) | own))
 
 

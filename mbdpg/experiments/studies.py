@@ -19,6 +19,9 @@ MUJOCO = ("HalfCheetah-v5", "Hopper-v5", "Ant-v5")
 ABLATED = "BipedalWalker-v3"
 """The task of Fig. 8 and 9, as in the paper."""
 
+ANT_OBSERVATION = 27
+"""Without contact forces, as in MBPO's and PETS' comparisons; the paper does not say."""
+
 RECORDED = "HalfCheetah-v5"
 """The task of Fig. 6, 7 and 9a, which the paper does not name."""
 
@@ -137,7 +140,8 @@ def _cell(scale: Scale, env: str, label: str = "mbdpg", algorithm: str = "mbdpg"
     preset, demonstrated = settings.pop("preset", "default"), settings.pop("demonstrated", False)
     agent = agent_config(algorithm, preset, env)
     settings = {name: value for name, value in scale.tiny.items() if hasattr(agent, name)} | settings
-    options = EnvOptions(max_episode_steps=PAPER_EPISODE_LIMIT)
+    size = ANT_OBSERVATION if env.startswith("Ant") else None
+    options = EnvOptions(max_episode_steps=PAPER_EPISODE_LIMIT, observation_size=size)
     return Cell(label, RunConfig(env, dataclasses.replace(agent, **settings), scale.schedule, options), demonstrated)
 
 

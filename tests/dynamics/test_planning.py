@@ -1,5 +1,7 @@
 """Planning: the cross-entropy method where the optimum is known, imagined returns, and planners as files."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -84,23 +86,37 @@ def test_the_cross_entropy_method_finds_the_optimum_of_a_linear_quadratic_proble
     assert float(found[0, 0]) == pytest.approx(best[0], abs=0.05)
 
 
-def test_few_iterations_from_the_last_plan_are_as_good_as_many_from_nothing() -> None:
-    place = np.asarray([0.5, 0.0])
+class KnownWorld(Planner):
+    """Plans in the linear-quadratic problem itself."""
 
-    def search(begin: jax.Array, iterations: int) -> float:
-        found = cross_entropy(
-            lambda plans: -cost(place, plans),
-            begin,
-            population=200,
-            elites=20,
-            iterations=iterations,
-            smoothing=0.1,
-            key=jax.random.key(1),
-        )
-        return float(cost(place, found[None])[0])
+    def imagined_return(self, observation: jax.Array, plans: jax.Array, *, key: jax.Array) -> jax.Array:
+        return -cost(observation, plans)
 
-    warm = jnp.asarray(optimal_plan(place), jnp.float32)[:, None]
-    assert search(warm, 2) < search(jnp.zeros((STEPS, 1)), 2)
+
+def test_a_policy_that_plans_anew_at_every_step_is_as_good_as_the_optimal_controller() -> None:
+    def cost_of(control: Callable[[np.ndarray], np.ndarray]) -> float:
+        state, total = np.asarray([0.4, 0.0]), 0.0
+        for _ in range(15):
+            action = float(control(state).item())
+            state = DYNAMICS @ state + INPUT * action
+            total += float(state @ COST @ state) + EFFORT * action**2
+        return total
+
+    settings = {"horizon": STEPS, "population": 200, "plan_elites": 20, "iterations": 12}
+    policy = PlanningPolicy(KnownWorld(**vars(planner(**settings))))
+    assert cost_of(policy) < 1.02 * cost_of(lambda state: optimal_plan(state)[:1])
+
+
+def test_plans_that_are_the_same_earn_the_same_whatever_the_noise() -> None:
+    # Particles of the second plan with luck of their own made it look better or worse than the first.
+    wide = jnp.full((MEMBERS, O + 1), 2.0)
+    loud = eqx.tree_at(
+        lambda x: (x.ensemble.members.max_log_variance, x.ensemble.members.min_log_variance), planner(), (wide, wide)
+    )
+    plans = jnp.full((5, HORIZON, A), 0.3)
+    found = [np.asarray(loud.imagined_return(jnp.zeros(O), plans, key=jax.random.key(seed))) for seed in (0, 1)]
+    np.testing.assert_allclose(found[0], found[0][0], rtol=1e-5)
+    assert abs(found[0][0] - found[1][0]) > 0.01
 
 
 def test_plans_stay_within_the_bounds() -> None:

@@ -86,13 +86,14 @@ def test_a_task_of_its_own_settings_keeps_all_others() -> None:
     ("preset", "algorithm", "env"),
     [(preset, name, env) for preset, own in TASKS.items() for name, tasks in own.items() for env in tasks],
 )
-def test_a_task_s_settings_are_of_a_registered_task_and_differ_from_the_others(
+def test_a_task_s_settings_are_of_registered_tasks_of_all_versions_and_differ_from_the_others(
     preset: str, algorithm: str, env: str
 ) -> None:
-    assert env in gymnasium.registry
+    ids = [known for known in gymnasium.registry if known.rpartition("-v")[0] == env]
+    assert ids
     for name, value in TASKS[preset][algorithm][env].items():
         assert getattr(agent_config(algorithm, preset), name) != value
-        assert getattr(agent_config(algorithm, preset, env), name) == value
+        assert {getattr(agent_config(algorithm, preset, known), name) for known in ids} == {value}
 
 
 def test_the_rivals_have_their_authors_sizes_and_settings() -> None:
@@ -149,6 +150,9 @@ def test_mbpo_has_its_authors_settings_for_each_task(
     assert (config.updates_per_step, config.final_rollout_length, config.lengthen_until) == (updates, length, until)
     assert actions is not None and config.entropy_per_action * actions[0] == pytest.approx(entropy)
     assert config.termination == "known" and config.lengthen_from == 20_000
+    cheap = agent_config("mbpo", "default", env)
+    assert (cheap.final_rollout_length, cheap.entropy_per_action) == (length, config.entropy_per_action)
+    assert cheap.termination == "learned"
 
 
 @pytest.mark.parametrize("algorithm", CONFIGS)

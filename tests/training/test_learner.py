@@ -12,6 +12,7 @@ import pytest
 from mbdpg.agents import mbdpg, mbpo, pets, sac, td3
 from mbdpg.dynamics.planning import Planner, PlanningPolicy
 from mbdpg.interfaces import Agent, Batch, EnvSpec, UserError
+from mbdpg.training import learner as learner_module
 from mbdpg.training.learner import Learner
 from mbdpg.training.replay import Replay
 
@@ -86,13 +87,13 @@ class Two(NamedTuple):
     metrics_alone: list[dict[str, np.ndarray]]
 
 
+MAKERS = {"td3": make_td3, "sac": make_sac, "pets": make_pets, "mbpo": make_mbpo, "mbdpg": make_mbdpg}
 LEARNERS = ["toy", "td3", "sac", "pets", *(pytest.param(name, marks=pytest.mark.slow) for name in ("mbpo", "mbdpg"))]
 
 
 @pytest.fixture(scope="module", params=LEARNERS)
 def two(request: pytest.FixtureRequest, toy: Any) -> Two:
-    makers = {"td3": make_td3, "sac": make_sac, "pets": make_pets, "mbpo": make_mbpo, "mbdpg": make_mbdpg}
-    make = (makers | {"toy": lambda: toy.ToyAgent(SPEC)})[request.param]
+    make = (MAKERS | {"toy": lambda: toy.ToyAgent(SPEC)})[request.param]
     together, alone = Learner(make(), [4, 9]), Learner(make(), [9])
     return Two(together, alone, learn(together, [4, 9]), learn(alone, [9]))
 
@@ -105,6 +106,23 @@ def test_each_of_several_seeds_learns_what_it_would_learn_alone_to_the_last_bit(
     assert same(two.together.policies()[1].arrays, two.alone.policies()[0].arrays)
     found, expected = diagnosed(two.together, [4, 9]), diagnosed(two.alone, [9])
     assert same({name: value[1:] for name, value in found.items()}, expected)
+
+
+@pytest.mark.parametrize(
+    "name", ["td3", "pets", *(pytest.param(name, marks=pytest.mark.slow) for name in ("sac", "mbpo", "mbdpg"))]
+)
+def test_all_seeds_under_one_vmap_learn_what_each_learns_alone_but_for_rounding(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    alone = Learner(MAKERS[name](), [9])
+    learn(alone, [9])
+    monkeypatch.setattr(learner_module, "over_seeds", jax.vmap)  # as on a GPU
+    together = Learner(MAKERS[name](), [4, 9])
+    learn(together, [4, 9])
+    found, expected = together.snapshot(1), alone.snapshot(0)
+    assert not same(together.snapshot(0), found) and found.keys() == expected.keys()
+    for key in found:
+        np.testing.assert_allclose(found[key], expected[key], rtol=1e-4, atol=1e-5, err_msg=key)
 
 
 def test_every_array_of_a_state_is_in_its_snapshot_and_comes_back(two: Two) -> None:
