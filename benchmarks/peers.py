@@ -2,7 +2,7 @@
 
 Runs in the environment that `make peers` builds, which has no mbdpg::
 
-    .venv-peers/bin/python benchmarks/peers.py sac HalfCheetah-v5 --steps 50000 --seed 0 --out results/peers.csv
+    .venv-peers/bin/python benchmarks/peers.py sac HalfCheetah-v5 --steps 50000 --seed 0 --out peers-sac.csv
 
 Beside it, for the same curve of ours: mbdpg train HalfCheetah-v5 --algorithm sac --preset paper --steps 50000 --seeds 0
 """

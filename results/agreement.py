@@ -21,6 +21,8 @@ from mbdpg.storage.metrics import read_metrics
 from mbdpg.storage.run_folder import RunFolder
 from mbdpg.training.evaluation import evaluate
 
+OUT = Path(__file__).resolve().with_name("peers.csv")
+
 EPISODES = range(10_000, 10_005)
 """Environment seeds of the peer's evaluation, benchmarks/peers.py."""
 
@@ -60,8 +62,10 @@ def rows_of_run(path: Path) -> list[dict[str, str]]:
 
 def main(paths: list[Path]) -> None:
     """Collect, write, compare."""
+    if any(path.resolve() == OUT for path in paths):
+        raise SystemExit(f"{OUT.name} is what is written, expected the files of benchmarks/peers.py and run folders")
     rows = [row for path in paths for row in (rows_of_peer(path) if path.suffix == ".csv" else rows_of_run(path))]
-    with open(Path(__file__).parent / "peers.csv", "w", newline="") as file:
+    with open(OUT, "w", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS)
         writer.writeheader()
         writer.writerows(rows)

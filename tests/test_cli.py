@@ -234,6 +234,12 @@ def test_an_unknown_verb_is_answered_with_the_known_ones(say: Any) -> None:
         (("Pendulum-v1", "--actor-learning-rate", "nan"), "--actor-learning-rate is nan"),
         (("Pendulum-v1", "--preset", "big"), "unknown --preset 'big'"),
         (
+            ("Pendulum-v1", "--horizon=5", "--algorithm", "td3"),
+            "--horizon is no setting of td3, but of mbdpg and pets;",
+        ),
+        (("Pendulum-v1", "--algorithm", "sac", "--no-terminal-value"), "--no-terminal-value is no setting of sac"),
+        (("BipedalWalker-v3", "--algorithm", "mbpo", "--termination", "known", "--steps", "50"), "the rule of Biped"),
+        (
             ("Pendulum-v1", "--algorithm", "ppo"),
             "unknown --algorithm 'ppo'; expected one of mbdpg, td3, sac, pets, mbpo",
         ),

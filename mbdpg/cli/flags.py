@@ -52,6 +52,6 @@ def one_line(text: str) -> str:
 
 
 def _plain(text: str) -> str:
-    """Tyro's boxed explanation as one line."""
+    """Tyro's boxed explanation as one line, without the box's title."""
     without_colors = re.sub(r"\x1b\[[0-9;]*m", "", text)
-    return one_line(re.sub(r"[╭╮╰╯│─]+|-{3,}", " ", without_colors))
+    return one_line(re.sub(r"╭[^╮]*╮|[╰╯│─]+|-{3,}", " ", without_colors))

@@ -16,8 +16,9 @@ from mbdpg.cli.demonstrate import Demonstrate, make_demonstrations
 from mbdpg.cli.flags import EnvArgument, parse, peek, program
 from mbdpg.experiments import presets, run
 from mbdpg.experiments.compilations import keep_compilations
-from mbdpg.experiments.config import Algorithm, EnvOptions, RunConfig
+from mbdpg.experiments.config import CONFIGS, Algorithm, EnvOptions, RunConfig
 from mbdpg.experiments.stopping import Stop
+from mbdpg.interfaces import require
 from mbdpg.reports.console import RunDisplay
 from mbdpg.reports.curves import draw_curves
 from mbdpg.training.loop import Schedule
@@ -69,6 +70,14 @@ def run_flags(verb: str, purpose: str, options: type[Any], args: list[str]) -> A
     schedule, env_options = presets.run_settings(preset)
     agent = presets.agent_config(algorithm, preset, args[0] if args else None)
     flat: Any = tyro.conf.OmitArgPrefixes
+    known = {field.name for kind in (options, Schedule, EnvOptions, type(agent)) for field in dataclasses.fields(kind)}
+    for flag in (arg.partition("=")[0] for arg in args if arg.startswith("--")):
+        name = flag[2:].replace("-", "_").removeprefix("no_")
+        others = [
+            other for other, kind in CONFIGS.items() if name in {field.name for field in dataclasses.fields(kind)}
+        ]
+        wrong = f"{flag} is no setting of {algorithm}, but of {' and '.join(others)}"
+        require(name in known or not others, f"{wrong}; see mbdpg {verb} --algorithm {algorithm} --help")
 
     def told(agent: Any) -> Any:
         command = dataclasses.make_dataclass(

@@ -50,7 +50,7 @@ def known_rule(env: EnvSpec) -> str:
     name, _, version = env.id.rpartition("-v")
     if name not in RULES or not version.isdigit() or (int(version) < 4 and name != "Pendulum"):
         raise UserError(
-            f"--termination is known, but nobody told us the rule of {env.id}; expected learned, or a task out of "
+            f"--termination is known, but the rule of {env.id} is not; expected learned, or a task out of "
             + ", ".join(RULES)
         )
     return name

@@ -173,7 +173,7 @@ def _ant_options(env_id: str, observation_size: int | None) -> dict[str, Any]:
     if observation_size is None:
         return {}
     if env_id != "Ant-v5":
-        raise UserError(f"observation_size is {observation_size}, but only Ant-v5 lets you choose; leave it out")
+        raise UserError(f"--observation-size is {observation_size}, but only Ant-v5 lets you choose; leave it out")
     if observation_size not in ANT_CONTACT_FORCES:
         raise UserError(f"Ant-v5 cannot have {observation_size} observations; expected 27 or 105 (the default)")
     return {"include_cfrc_ext_in_observation": ANT_CONTACT_FORCES[observation_size]}

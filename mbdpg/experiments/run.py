@@ -60,12 +60,6 @@ def train(
     make = make_env or config.make_env
     spec = _spec_of(make)
     demonstrations = Demonstrations.load(Path(config.demonstrations), spec) if config.demonstrations else None
-    if config.schedule.steps <= config.agent.random_steps:
-        print(
-            f"mbdpg: nothing will be learned: all {config.schedule.steps:,} --steps are --random-steps "
-            f"({config.agent.random_steps:,})",
-            file=sys.stderr,
-        )
     description = config.to_json() | {"commit": _commit(), "machine": describe_machine()}
     folders: list[RunFolder] = []
     with contextlib.ExitStack() as undo, contextlib.ExitStack() as stack:
@@ -76,6 +70,12 @@ def train(
         training = _compose(config, spec, make, seeds, [Recorder(folder) for folder in folders], stack, demonstrations)
         training.save()
         undo.pop_all()  # from here on, there is something to go on from
+        if config.schedule.steps <= config.agent.random_steps:
+            print(
+                f"mbdpg: nothing will be learned: all {config.schedule.steps:,} --steps are --random-steps "
+                f"({config.agent.random_steps:,})",
+                file=sys.stderr,
+            )
         training.run(on_update, should_stop)
     return [folder.path for folder in folders]
 

@@ -198,7 +198,7 @@ def test_a_known_rule_takes_the_place_of_the_learned_one() -> None:
     rows, _ = imagined(2, env=EnvSpec("Ant-v5", O, A, None, None), termination="known")
     height = rows.next_observation[..., 0]
     np.testing.assert_array_equal(rows.terminated == 0, (height >= 0.2) & (height <= 1.0))
-    with pytest.raises(UserError, match="nobody told us the rule of made-in-code"):
+    with pytest.raises(UserError, match="the rule of made-in-code is not"):
         agent(termination="known")
 
 

@@ -42,6 +42,6 @@ def test_tasks_without_an_end_go_on(name: str) -> None:
 
 def test_a_rule_that_nobody_told_us_is_refused_with_those_that_are_known() -> None:
     for env in ("BipedalWalker-v3", "Hopper-v3", "Hopper", "MyHopper-v5"):
-        with pytest.raises(UserError, match=f"--termination is known, but nobody told us the rule of {env}; expected"):
+        with pytest.raises(UserError, match=f"--termination is known, but the rule of {env} is not; expected"):
             known_rule(spec(env))
     assert known_rule(spec("Pendulum-v1")) == "Pendulum"
