@@ -147,10 +147,18 @@ def sweep(
     with only_writer(out):
         if not kept.exists():
             replace_durably(kept, plan.encode())
+        _drop_torn_line(out / JOURNAL)
         failures = launch(works, engine, logs=out / "logs", say=say, should_stop=should_stop)
         if not should_stop():
             _conclude(works, out, say)
     require(not failures, f"{len(failures)} of {trials} trials failed, see {out / 'logs'}")
+
+
+def _drop_torn_line(journal: Path) -> None:
+    """Cut what a lost machine left of its last line: Optuna would append to it, and never read the journal again."""
+    if journal.exists():
+        with open(journal, "r+b") as file:
+            file.truncate(file.read().rfind(b"\n") + 1)
 
 
 def returns(training: Training) -> dict[int, float]:

@@ -128,6 +128,16 @@ def test_a_sweep_goes_on_where_it_was_and_says_what_was_best(here: None, tmp_pat
 
 
 @extras
+def test_a_journal_whose_last_line_was_torn_goes_on(here: None, tmp_path: Path) -> None:
+    begin(tmp_path, trials=1)
+    with open(tmp_path / module.JOURNAL, "ab") as file:
+        file.write(b'{"op_code": 4, "worker')
+    begin(tmp_path, trials=2)
+    assert [row["state"] for row in table(tmp_path)] == ["complete"] * 2
+    assert len(module.opened(tmp_path).trials) == 2
+
+
+@extras
 def test_a_trial_that_was_stopped_goes_on_with_the_same_settings(here: None, tmp_path: Path) -> None:
     (tmp_path / "sweep").mkdir()
     trial = Trial(0, CONFIG, tuple(SEARCHES), (0,), False, tmp_path / "sweep")
