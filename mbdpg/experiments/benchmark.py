@@ -102,10 +102,10 @@ def benchmark(say: Callable[[str], None], *, growth: bool = True) -> dict[str, A
 
 def cost_of(phase_name: str, config: mbdpg.Config) -> Cost:
     """Time one update of a phase, as training takes it, and its matrix products alone."""
-    learner = _learner(config)
-    phase = _phase(learner.agent, phase_name)
-    ms = _update_ms(learner, phase)
-    batch = jax.tree.map(lambda x: x[0], _batches(phase, 1))
+    learner = made_up_learner(config)
+    phase = phase_of(learner.agent, phase_name)
+    ms = update_ms(learner, phase)
+    batch = jax.tree.map(lambda x: x[0], made_up_batches(phase, 1))
     state = jax.tree.map(lambda x: x[0], learner.state)
     update = jax.make_jaxpr(lambda s, b, k: phase.update(s, b, key=k))(state, batch, jax.random.key(0))
     products = matrix_products(update.jaxpr)
@@ -161,7 +161,7 @@ def _product_seconds(product: Product) -> float:
 
 def _acting(say: Callable[[str], None]) -> dict[str, float]:
     """The NumPy policy's time per action, and environment steps per second with it."""
-    policy = _learner(PAPER_SIZES).policies()[0]
+    policy = made_up_learner(PAPER_SIZES).policies()[0]
     env = RunConfig(TASK).make_env()
     observation = env.reset(seed=0)
 
@@ -204,10 +204,10 @@ def start(settings: str, rows: str, began: str) -> None:
         rows: environment steps in the replay.
         began: seconds since the epoch at which the process was started.
     """
-    learner = _learner(mbdpg.Config(**json.loads(settings)))
+    learner = made_up_learner(mbdpg.Config(**json.loads(settings)))
     for phase in learner.agent.phases:
         if phase.updates_per_step:
-            learner.update(phase, [_batches(phase, 1)], 0)
+            learner.update(phase, [made_up_batches(phase, 1)], 0)
     seconds = time.time() - float(began)
     kept = _replay(int(rows))
     print(json.dumps({"seconds": seconds, "memory_mb": _peak_memory_mb(), "rows": kept.size}))
@@ -233,15 +233,16 @@ def _growth(say: Callable[[str], None]) -> dict[str, dict[str, dict[int, float]]
                 name, {name: size}
             )
             config = dataclasses.replace(PAPER_SIZES, **changed)
-            learner = _learner(config, size if name == "seeds" else 1)
+            learner = made_up_learner(config, size if name == "seeds" else 1)
             for kind, times in grown[name].items():
-                times[size] = _update_ms(learner, _phase(learner.agent, kind))
+                times[size] = update_ms(learner, phase_of(learner.agent, kind))
             say(f"{name} {size}: " + ", ".join(f"{kind} {times[size]:.1f} ms" for kind, times in grown[name].items()))
     return grown
 
 
-def _update_ms(learner: Learner, phase: Phase) -> float:
-    batches = [_batches(phase, UPDATES)] * len(learner.policies())
+def update_ms(learner: Learner, phase: Phase) -> float:
+    """Milliseconds of one update, of several in one call as in training."""
+    batches = [made_up_batches(phase, UPDATES)] * len(learner.policies())
     return 1e3 * _median_seconds(lambda: learner.update(phase, batches, 0)) / UPDATES
 
 
@@ -256,17 +257,20 @@ def _median_seconds(call: Callable[[], Any]) -> float:
     return float(np.median(seconds))
 
 
-def _learner(config: mbdpg.Config, seeds: int = 1) -> Learner:
+def made_up_learner(config: mbdpg.Config, seeds: int = 1) -> Learner:
+    """Fresh networks in the units of made-up experience."""
     learner = Learner(mbdpg.MBDPG(config, SPEC), range(seeds))
     learner.prepare([_replay(ROWS).statistics(0.0)] * seeds)
     return learner
 
 
-def _phase(agent: Agent, name: str) -> Phase:
+def phase_of(agent: Agent, name: str) -> Phase:
+    """By its name."""
     return next(phase for phase in agent.phases if phase.name == name)
 
 
-def _batches(phase: Phase, updates: int) -> Any:
+def made_up_batches(phase: Phase, updates: int) -> Any:
+    """What a phase learns from."""
     return _replay(ROWS).sample(updates, phase.sampling, np.random.default_rng(0))
 
 

@@ -51,11 +51,11 @@ def test_loops_count_as_often_as_they_go_round_and_branches_once() -> None:
 
 
 def test_an_update_of_the_critics_and_actor_takes_no_weight_gradient_of_the_dynamics() -> None:
-    learner = benchmark._learner(dataclasses.replace(TINY, memory=6))
+    learner = benchmark.made_up_learner(dataclasses.replace(TINY, memory=6))
     state = jax.tree.map(lambda x: x[0], learner.state)
     counts = {}
     for phase in learner.agent.phases[1:]:
-        batch = jax.tree.map(lambda x: x[0], benchmark._batches(phase, 1))
+        batch = jax.tree.map(lambda x: x[0], benchmark.made_up_batches(phase, 1))
         program = jax.make_jaxpr(lambda s, b, k, phase=phase: phase.update(s, b, key=k))(
             state, batch, jax.random.key(0)
         )
