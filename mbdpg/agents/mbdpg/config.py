@@ -30,8 +30,6 @@ class Config:
     """Adam's step size for the actor."""
     critic_learning_rate: float = 3e-4
     """Adam's step size for the critics."""
-    decay_after: int = 0
-    """Updates after which step sizes of actor and critics shrink as one over the root of all updates; 0: never."""
     actor_clip: float = 10.0
     """Global norm to which the actor's gradient is clipped."""
     critic_clip: float = 1e6

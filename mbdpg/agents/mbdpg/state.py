@@ -60,21 +60,15 @@ class Optimizers(NamedTuple):
 def optimizers(config: Config) -> Optimizers:
     """Adam behind a global-norm clip; a gradient that is not finite is skipped and counted."""
 
-    def decayed(learning_rate: float) -> optax.ScalarOrSchedule:
-        after = config.decay_after
-        if after == 0:
-            return learning_rate
-        return lambda updates: learning_rate * jnp.minimum(jnp.sqrt(after / jnp.maximum(updates, 1)), 1.0)
-
-    def one(learning_rate: optax.ScalarOrSchedule, clip: float) -> optax.GradientTransformation:
+    def one(learning_rate: float, clip: float) -> optax.GradientTransformation:
         return optax.apply_if_finite(
             optax.chain(optax.clip_by_global_norm(clip), optax.adam(learning_rate)), max_consecutive_errors=10**9
         )
 
     return Optimizers(
         dynamics=one(config.dynamics_learning_rate, config.dynamics_clip),
-        actor=one(decayed(config.actor_learning_rate), config.actor_clip),
-        critic=one(decayed(config.critic_learning_rate), config.critic_clip),
+        actor=one(config.actor_learning_rate, config.actor_clip),
+        critic=one(config.critic_learning_rate, config.critic_clip),
     )
 
 
