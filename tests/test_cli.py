@@ -362,7 +362,8 @@ def test_a_study_that_cannot_be_is_refused(say: Any, flags: Any, said: str) -> N
     ("flags", "said"),
     [
         ((), "nothing is searched; say what with --search"),
-        (("--search", "wings=1:2"), "there is no --wings"),
+        (("--search", "wings=1:2"), "'wings' is no setting"),
+        (("--search", "width=1:2", "--out", "/dev/null"), "/dev/null cannot be the folder of a sweep"),
         (("--search", "width=1:2", "width=3:4"), "--search has a setting twice"),
         (("--search", "width=1:2", "--trials", "0"), "--trials is 0, expected at least 1"),
         (("--search", "width=1:2", "--seeds", "1", "1"), "--seeds are [1, 1], expected"),
@@ -459,6 +460,15 @@ def test_report_compares_runs_in_tables_and_on_a_page(say: Any, toys: None) -> N
         say("report", "runs", "--at", "30"), "--at is 30, expected a step at which all were evaluated: 0, 20, 40"
     )
     check_refused(say("report"), "expected run folders")
+
+
+def test_a_stranger_s_run_does_not_write_control_characters_to_the_terminal(say: Any, toys: None) -> None:
+    assert say("train", "Pendulum-v1", *TINY, "--out", "run").status == 0
+    config = Path("run/seed-0/config.json")
+    config.write_text(config.read_text().replace("Pendulum-v1", "Pendulum\\u001b[31m-v1"))
+    said = say("report", "run")
+    assert said.status == 0, said.err
+    assert said.out.splitlines()[0] == r"Pendulum\x1b[31m-v1"
 
 
 def test_report_without_a_common_step_is_refused_but_for_its_page(say: Any, toys: None) -> None:

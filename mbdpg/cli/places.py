@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 from mbdpg.experiments.launch import Local, Ray, cores
-from mbdpg.interfaces import require
+from mbdpg.interfaces import UserError, require
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,19 @@ class Places:
     """Of a Ray cluster whose nodes share the file system, as in 10.0.0.1:6379; by default one is begun here."""
     gpus: bool = False
     """With Ray: a GPU for every piece of work, which trains all its seeds at once."""
+
+
+def made(out: Path, what: str) -> Path:
+    """The folder itself, as an absolute path.
+
+    Raises:
+        UserError: it cannot be one.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{out} cannot be {what} ({error.strerror}); choose another --out") from error
+    return out.absolute()
 
 
 def say(line: str) -> None:

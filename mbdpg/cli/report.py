@@ -39,7 +39,8 @@ def report(args: list[str]) -> None:
     for environment in environments:
         # Without a common step the page still has the curves, and says what is missing.
         lines = table(environment.rows) if environment.rows or flags.out is None else [NO_COMMON_STEP]
-        print(environment.name, *lines, sep="\n")
+        # A run may be a stranger's: nothing in it is to move the terminal's cursor.
+        print("\n".join(line if line.isprintable() else repr(line)[1:-1] for line in (environment.name, *lines)))
     if flags.out is not None:
         write_page(flags.out, contents(environments))
         print(f"page with curves, settings and more: {flags.out}")

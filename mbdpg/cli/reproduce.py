@@ -10,11 +10,11 @@ from typing import Annotated
 import tyro
 
 from mbdpg.cli.flags import parse, program
-from mbdpg.cli.places import Places, engine_of, say
+from mbdpg.cli.places import Places, engine_of, made, say
 from mbdpg.experiments.reproduce import reproduce as reproduce_study
 from mbdpg.experiments.stopping import Stop
 from mbdpg.experiments.studies import ScaleName, StudyName
-from mbdpg.interfaces import UserError, require
+from mbdpg.interfaces import require
 
 
 @dataclass(frozen=True)
@@ -40,13 +40,7 @@ def reproduce(args: list[str]) -> None:
     require(all(0 <= seed < 2**31 for seed in flags.seeds), f"--seeds are {flags.seeds}, expected from 0 to 2^31 - 1")
     require(len(set(flags.seeds)) == len(flags.seeds), f"--seeds are {flags.seeds}, expected different ones")
     engine = engine_of(flags.places)
-    out = flags.out or Path("studies") / flags.scale
-
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"{out} cannot be a folder of studies ({error.strerror}); choose another --out") from error
-
+    out = made(flags.out or Path("studies") / flags.scale, "a folder of studies")
     with Stop() as stop:
-        reproduce_study(flags.study, flags.scale, out.absolute(), engine, seeds=flags.seeds, say=say, should_stop=stop)
+        reproduce_study(flags.study, flags.scale, out, engine, seeds=flags.seeds, say=say, should_stop=stop)
         stop.exit_if_asked(f"{program()} reproduce {shlex.join(args)}")

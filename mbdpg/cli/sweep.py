@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import tyro
 
 from mbdpg.cli.flags import program
-from mbdpg.cli.places import Places, engine_of, say
+from mbdpg.cli.places import Places, engine_of, made, say
 from mbdpg.cli.train import default_folder, run_flags
 from mbdpg.experiments import presets
 from mbdpg.experiments.config import Algorithm, RunConfig
@@ -54,8 +54,10 @@ def sweep(args: list[str]) -> None:
     require(different, f"--seeds are {list(run.seeds)}, expected numbers from 0 to 2^31 - 1, all different")
     searches = [Search.parse(text, config.agent) for text in run.search]
     require(len({search.name for search in searches}) == len(searches), "--search has a setting twice")
-    out = (run.out or default_folder("sweeps", config)).absolute()
     config.make_env().close()  # a wrong task is better said once than by every trial
+    engine = engine_of(run.places)
+    out = made(run.out or default_folder("sweeps", config), "the folder of a sweep")
+    say(f"{run.trials} trials in {out}")
 
     with Stop() as stop:
         search_settings(
@@ -65,7 +67,7 @@ def sweep(args: list[str]) -> None:
             seeds=run.seeds,
             prune=run.prune,
             out=out,
-            engine=engine_of(run.places),
+            engine=engine,
             say=say,
             should_stop=stop,
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import multiprocessing
 import os
 import re
@@ -29,6 +30,8 @@ FAILED = 1
 """Exit status of work that raised, which would do so again."""
 
 POLL_SECONDS = 0.5
+ALIVE = "alive"
+"""File beside the logs that every process of this machine's holds while it lives."""
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -89,6 +92,7 @@ def launch(
     if not due:
         return {}
     if isinstance(engine, Local):
+        _await_orphans(logs, say, should_stop)
         return _Pool(engine.workers, logs, say).run(due, should_stop)
     return _on_ray(due, engine, logs, say, should_stop)
 
@@ -101,6 +105,20 @@ def cores() -> list[int]:
 def log_of(work: Work, logs: Path) -> Path:
     """The file that gets what a piece of work prints."""
     return logs / f"{re.sub(r'[^A-Za-z0-9.=-]+', '-', work.name)}.log"
+
+
+def _await_orphans(logs: Path, say: Callable[[str], None], should_stop: Callable[[], bool]) -> None:
+    """Let processes whose parent was killed notice it and save; until then their runs are in use."""
+    said = False
+    with open(logs / ALIVE, "ab") as file:
+        while not should_stop():
+            try:
+                return fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                if not said:
+                    say("waiting for the processes of a run that was killed to save and end")
+                said = True
+                time.sleep(POLL_SECONDS)
 
 
 class _Pool:
@@ -172,7 +190,8 @@ class _Pool:
 
 def _in_process(work: Work, cores: list[int], log: Path) -> None:
     parent = os.getppid()
-    with open(log, "a", encoding="utf-8") as file, Stop() as stop:
+    with open(log, "a", encoding="utf-8") as file, open(log.with_name(ALIVE), "ab") as alive, Stop() as stop:
+        fcntl.flock(alive, fcntl.LOCK_SH)
         for stream in (1, 2):
             os.dup2(file.fileno(), stream)
         # A signal for all of a terminal or of a group is the parent's to pass on, once: a second one would not wait.

@@ -72,7 +72,7 @@ class ModelFit:
         Raises:
             UserError: those that are there are of other settings.
         """
-        return made_as(self.out, self._settings())
+        return made_as(self.out, self._settings()) and is_whole(self.out)
 
     def __call__(self, should_stop: Callable[[], bool]) -> None:
         """Do it; stopped, it leaves nothing behind: it takes minutes."""
@@ -111,6 +111,13 @@ class ModelFit:
         rows = [(depth, f"{error:.5g}", f"{still:.5g}") for depth, (error, still) in enumerate(found, start=1)]
         say_made_as(self.out, self._settings())
         replace_table(self.out, [("depth", "rmse", "persistence"), *rows])
+
+
+def is_whole(file: Path) -> bool:
+    """Whether a file of errors is there with all its rows; a model whose file lost some is trained again."""
+    text = file.read_text(encoding="utf-8", errors="replace") if file.is_file() else ""
+    rows = text.splitlines()
+    return text.endswith("\n") and len(rows) == STEPS + 1 and all(row.count(",") == 2 for row in rows)
 
 
 @final

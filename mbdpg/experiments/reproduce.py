@@ -10,7 +10,7 @@ from typing import Any
 from mbdpg.experiments import expert
 from mbdpg.experiments.config import RunConfig
 from mbdpg.experiments.launch import Local, Ray, Work, launch
-from mbdpg.experiments.model_study import ModelFit
+from mbdpg.experiments.model_study import ModelFit, is_whole
 from mbdpg.experiments.studies import RECORDED, SCALES, Cell, Model, Scale, ScaleName, Study, StudyName, study
 from mbdpg.experiments.work import Demonstrating, Training
 from mbdpg.interfaces import require
@@ -119,7 +119,7 @@ def _draw(chosen: Study, scale: Scale, out: Path, say: Callable[[str], None]) ->
     for panel in chosen.panels:
         if panel.models:
             files = {
-                model.label: [file for seed in scale.seeds if (file := _errors_file(model, seed, out)).exists()]
+                model.label: [file for seed in scale.seeds if is_whole(file := _errors_file(model, seed, out))]
                 for model in panel.models
             }
             panels.append(Errors(panel.title, {label: found for label, found in files.items() if found}))

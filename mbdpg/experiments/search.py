@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, final, get_args, get_origin, get_type_hints
+from typing import Any, final, get_args, get_type_hints
 
-from mbdpg.interfaces import UserError, flag_of, require
+from mbdpg.interfaces import UserError, require
 
 
 @final
@@ -31,29 +32,29 @@ class Search:
         name, equals, values = text.partition("=")
         name = name.removeprefix("--").replace("-", "_")
         known = {field.name for field in dataclasses.fields(agent)}
-        require(name in known, f"--search {text}: there is no {flag_of(name)}; expected a setting of the algorithm")
+        near = difflib.get_close_matches(name, known, 1) or sorted(known)[:1]
+        require(name in known, f"--search {text}: {name!r} is no setting of the algorithm; one is {near[0]}")
         low, colon, rest = values.partition(":")
         if not colon:
             choices = tuple(part for part in values.split(",") if part)
-            different = bool(equals) and 1 < len(choices) == len(set(choices))
-            require(different, f"--search {text}: expected {name}=LOW:HIGH or {name}=A,B,C")
-            for choice in choices:
-                _typed(choice, get_type_hints(type(agent))[name], text)
+            wanted = f"expected at least two, {_choices(get_type_hints(type(agent))[name], name)}"
+            require(bool(equals) and len(choices) > 1, f"--search {text}: {wanted}")
+            values_ = {_typed(choice, get_type_hints(type(agent))[name], text) for choice in choices}
+            require(len(values_) == len(choices), f"--search {text}: {wanted}, all different")
             return cls(name, choices=choices)
         kind = get_type_hints(type(agent))[name]
         if kind not in (int, float):
-            names = ", ".join(map(str, get_args(kind))) or "true, false"
-            raise UserError(f"--search {text}: expected some of {names}, with commas between")
+            raise UserError(f"--search {text}: expected {_choices(kind, name)}")
         high, _, scale = rest.partition(":")
         require(scale in ("", "log"), f"--search {text}: expected :log or nothing after the range")
         try:
             found = cls(name, float(low), float(high), scale == "log")
         except ValueError as error:
             raise UserError(f"--search {text}: expected numbers, {name}=LOW:HIGH") from error
-        whole = kind is float or round(found.low) < round(found.high)
-        require(whole, f"--search {text}: expected two whole numbers, a lower one before a higher one")
         ordered = math.isfinite(found.low) and math.isfinite(found.high) and found.low < found.high
         require(ordered, f"--search {text}: expected a lower number before a higher one")
+        whole = kind is float or (found.low.is_integer() and found.high.is_integer())
+        require(whole, f"--search {text}: expected two whole numbers, a lower one before a higher one")
         require(not found.log or found.low > 0, f"--search {text}: a logarithmic range begins above 0")
         return found
 
@@ -69,16 +70,26 @@ class Search:
 
 def _typed(choice: str, kind: Any, text: str) -> Any:
     """A choice as the setting's type has it."""
-    if get_origin(kind) is Literal:
-        known = {str(value): value for value in get_args(kind)}
-        expected = f"some of {', '.join(known)}, with commas between"
-    elif kind is bool:
-        known, expected = {"true": True, "false": False}, "true,false"
-    else:
+    if kind in (int, float):
         try:
-            return kind(choice)
+            number = kind(choice)
         except ValueError as error:
             numbers = "whole numbers" if kind is int else "numbers"
             raise UserError(f"--search {text}: expected {numbers}, not {choice}") from error
-    require(choice in known, f"--search {text}: expected {expected}")
+        require(math.isfinite(number), f"--search {text}: expected finite numbers, not {choice}")
+        return number
+    known = _named(kind)
+    require(choice in known, f"--search {text}: expected {_choices(kind, '')}")
     return known[choice]
+
+
+def _named(kind: Any) -> dict[str, Any]:
+    """The values of a setting that is no number, by name."""
+    return {"true": True, "false": False} if kind is bool else {str(value): value for value in get_args(kind)}
+
+
+def _choices(kind: Any, name: str) -> str:
+    """What may be searched of a setting."""
+    if kind in (int, float):
+        return f"{name}=LOW:HIGH or {name}=A,B,C"
+    return f"some of {', '.join(_named(kind))}, with commas between"

@@ -140,8 +140,11 @@ def sweep(
     searched = [dataclasses.asdict(search) for search in searches]
     plan = json.dumps({"run": config.to_json(), "search": searched, "seeds": list(seeds)}, indent=2)
     kept = out / "sweep.json"
-    same = not kept.exists() or kept.read_text(encoding="utf-8") == plan
-    require(same, f"{out} is of another sweep; go on with its own flags, or choose another --out")
+    same = not kept.exists() or kept.read_text(encoding="utf-8", errors="replace") == plan
+    differs = f"{out} is of another sweep, or its {kept.name} is damaged; go on with its own flags"
+    require(same, f"{differs}, or choose another --out")
+    lost = not (out / JOURNAL).exists() and any(out.glob("trial-*"))
+    require(not lost, f"{out} has trials but no {JOURNAL}; put it back, or choose another --out")
     out.mkdir(parents=True, exist_ok=True)
     works = [Trial(number, config, tuple(searches), tuple(seeds), prune, out) for number in range(trials)]
     with only_writer(out):
@@ -200,7 +203,8 @@ def _conclude(works: Sequence[Trial], out: Path, say: Callable[[str], None]) -> 
         settings, score_ = note.get("settings", {}), values.get(note.get("trial"), "")
         rows.append((number, note.get("state", "missing"), score_, *(settings.get(name, "") for name in names)))
     replace_table(out / "sweep.csv", rows)
-    say(f"{len(done)} of {len(works)} trials completed; all of them in {out / 'sweep.csv'}")
+    completed = sum(note.get("state") == "complete" for note in notes)
+    say(f"{completed} of {len(works)} trials completed; all of them in {out / 'sweep.csv'}")
     best = max((note for note in notes if note.get("trial") in values), key=lambda note: values[note["trial"]])
     flags = " ".join(f"{flag_of(name)} {value}" for name, value in best["settings"].items())
     say(f"best, {values[best['trial']]:,.1f}: {flags}")

@@ -16,7 +16,7 @@ from mbdpg.storage.run_folder import RunFolder
 LOOKS_ON = {"steps", "evaluate_every", "evaluation_episodes", "log_every", "checkpoint_every"}
 """Settings that change nothing of what is learned at a step."""
 
-NO_COMMON_STEP = "these runs have no evaluation at the same step; train them further, or report fewer"
+NO_COMMON_STEP = "these runs have no evaluation at the same step, or none yet; train them further, or report fewer"
 
 
 class Row(NamedTuple):

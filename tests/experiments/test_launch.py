@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import importlib
 import os
 import signal
@@ -10,12 +11,13 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from threading import Timer
 from typing import Any
 
 import pytest
 
 import mbdpg
-from mbdpg.experiments.launch import ATTEMPTS, Local, Ray, launch
+from mbdpg.experiments.launch import ALIVE, ATTEMPTS, Local, Ray, launch
 from mbdpg.interfaces import UserError
 
 PIECES = """
@@ -100,6 +102,19 @@ def test_asked_to_stop_it_lets_each_piece_save(piece: Any, tmp_path: Path) -> No
     assert failures == {} and time.monotonic() - began < 60
     assert (tmp_path / "long").read_text() == "saved"
     assert works[1].count() == 0
+
+
+def test_processes_of_a_launch_that_was_killed_are_waited_for(piece: Any, tmp_path: Path) -> None:
+    # Begun again at once, a study failed those pieces whose runs they still held.
+    (tmp_path / "logs").mkdir()
+    said: list[str] = []
+    with open(tmp_path / "logs" / ALIVE, "ab") as orphan:
+        fcntl.flock(orphan, fcntl.LOCK_SH)
+        Timer(1.5, lambda: fcntl.flock(orphan, fcntl.LOCK_UN)).start()
+        began = time.monotonic()
+        assert launch([piece("a")], Local(1), logs=tmp_path / "logs", say=said.append) == {}
+    assert time.monotonic() - began > 1
+    assert said == ["waiting for the processes of a run that was killed to save and end", "a: done"]
 
 
 LAUNCHER = """

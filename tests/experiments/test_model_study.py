@@ -78,6 +78,11 @@ def test_a_fit_leaves_the_errors_of_its_model(
     assert not fit.finished()
     fit(lambda: False)
     assert fit.finished() and out.read_text().startswith("depth,rmse,persistence\n1,")
+    whole = out.read_bytes()
+    for part in (b"", whole[: len(whole) // 2], whole[:-3], whole.rsplit(b"\r\n", 2)[0] + b"\r\n"):
+        out.write_bytes(part)  # a part of it was drawn as if it were all
+        assert not fit.finished()
+    out.write_bytes(whole)
     table = np.loadtxt(out, delimiter=",", skiprows=1)
     assert table.shape == (6, 3) and list(table[:, 0]) == [1, 2, 3, 4, 5, 6] and np.isfinite(table).all()
     longer = dataclasses.replace(fit, updates=600, out=tmp_path / "longer.csv")

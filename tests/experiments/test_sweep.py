@@ -58,9 +58,16 @@ def test_a_search_gives_values_of_the_settings_own_type(text: str, value: Any) -
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("wings=1:2", "there is no --wings; expected a setting of the algorithm"),
-        ("horizon", "expected horizon=LOW:HIGH or horizon=A,B,C"),
-        ("horizon=5", "expected horizon=LOW:HIGH or horizon=A,B,C"),
+        ("wings=1:2", "'wings' is no setting of the algorithm; one is "),
+        ("horizn=1:2", "'horizn' is no setting of the algorithm; one is horizon"),
+        ("=1:2", "'' is no setting of the algorithm"),
+        ("horizon", "expected at least two, horizon=LOW:HIGH or horizon=A,B,C"),
+        ("horizon=5", "expected at least two, horizon=LOW:HIGH or horizon=A,B,C"),
+        ("horizon=1:inf", "expected a lower number before a higher one"),
+        ("horizon=nan:5", "expected a lower number before a higher one"),
+        ("horizon=0.4:5:log", "expected two whole numbers"),
+        ("discount=0.9,nan", "expected finite numbers, not nan"),
+        ("discount=0.9,0.90", "all different"),
         ("horizon=a:b", "expected numbers, horizon=LOW:HIGH"),
         ("discount=1:0.5", "expected a lower number before a higher one"),
         ("discount=0:1:log", "a logarithmic range begins above 0"),
@@ -68,11 +75,12 @@ def test_a_search_gives_values_of_the_settings_own_type(text: str, value: Any) -
         ("discount=0:inf", "expected a lower number before a higher one"),
         ("horizon=1.5,2", "expected whole numbers"),
         ("horizon=2.6:2.9", "expected two whole numbers, a lower one before a higher one"),
-        ("terminal-value=true,true", "expected terminal_value=LOW:HIGH or terminal_value=A,B,C"),
+        ("terminal-value=true,true", "expected at least two, some of true, false, with commas between"),
+        ("gradient=full", "expected at least two, some of full, eq19"),
         ("gradient=1:2", "expected some of full, eq19, with commas between"),
         ("gradient=full,half", "expected some of full, eq19, with commas between"),
         ("trace=low,high", "expected numbers"),
-        ("terminal-value=yes,no", "expected true,false"),
+        ("terminal-value=yes,no", "expected some of true, false"),
     ],
 )
 def test_a_search_that_cannot_be_is_refused_before_anything_is_trained(text: str, said: str) -> None:
@@ -135,6 +143,18 @@ def test_a_journal_whose_last_line_was_torn_goes_on(here: None, tmp_path: Path) 
     begin(tmp_path, trials=2)
     assert [row["state"] for row in table(tmp_path)] == ["complete"] * 2
     assert len(module.opened(tmp_path).trials) == 2
+
+
+@extras
+def test_a_sweep_that_lost_its_journal_or_its_plan_says_so(here: None, tmp_path: Path) -> None:
+    begin(tmp_path, trials=1)
+    (tmp_path / module.JOURNAL).rename(tmp_path / "kept")
+    with pytest.raises(UserError, match=r"has trials but no journal.log; put it back"):
+        begin(tmp_path, trials=2)
+    (tmp_path / "kept").rename(tmp_path / module.JOURNAL)
+    (tmp_path / "sweep.json").write_text("{")
+    with pytest.raises(UserError, match=r"of another sweep, or its sweep.json is damaged"):
+        begin(tmp_path, trials=2)
 
 
 @extras
