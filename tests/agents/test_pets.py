@@ -1,5 +1,7 @@
 """PETS: it fits its world, and plans with the best of it."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -41,6 +43,22 @@ def test_instruments_are_of_the_model_alone() -> None:
     )
     metrics = one.diagnose(one.init(key=jax.random.key(0)), windows, jnp.zeros(4))
     assert set(metrics) == {f"dynamics/{x}_k{k:02d}" for x in ("rmse", "persistence") for k in (1, 5, 10, 20)}
+
+
+def test_a_fit_moves_every_parameter_and_nothing_but_the_ensemble(differences: Callable[..., set[str]]) -> None:
+    (phase,), before = agent().phases, agent().init(key=jax.random.key(0))
+    rng, size = np.random.default_rng(0), phase.sampling.batch_size
+    shapes = {"observation": (2,), "action": (1,), "reward": (), "next_observation": (2,)}
+    drawn = {name: jnp.asarray(rng.normal(size=(size, 1, *shape)), jnp.float32) for name, shape in shapes.items()}
+    ends = jnp.asarray(np.arange(size) % 3 == 0, jnp.float32)[:, None]  # the terminal reward's head learns from them
+    batch = Batch(**drawn, terminated=ends, valid=jnp.ones((size, 1)))
+    fit = jax.jit(phase.update)
+    after, _ = fit(before, batch, key=jax.random.key(1))
+    assert differences(before, after) == {"ensemble", "optimizer"}
+    for old, new in zip(jax.tree.leaves(before.ensemble), jax.tree.leaves(after.ensemble), strict=True):
+        assert all((a != b).any() for a, b in zip(old, new, strict=True))  # of each member
+    bad, metrics = fit(before, batch._replace(reward=batch.reward.at[0].set(jnp.nan)), key=jax.random.key(1))
+    assert differences(before, bad) == {"optimizer"} and metrics["dynamics/skipped"] == 1
 
 
 def test_it_brings_a_point_to_where_the_reward_is() -> None:
