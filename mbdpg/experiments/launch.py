@@ -262,7 +262,7 @@ def _connected(address: str | None) -> Any:
         raise UserError("--engine ray needs Ray, which is not installed: pip install 'mbdpg[ray]'") from error
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    if address is None:  # Ray's own servers know no passwords: this one is for this machine alone
+    if address is None:  # for this machine alone
         address = "local"
         options |= {"include_dashboard": False, "_node_ip_address": "127.0.0.1"}
     elif re.fullmatch(r"[^/]+:[0-9]{1,5}", address):

@@ -33,7 +33,11 @@ CONFIG = RunConfig("Pendulum-v1", td3.Config(width=8, batch_size=8, random_steps
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[str]:
-    """The address of a head and a worker node on loopback, with a core each; other clusters are left alone."""
+    """The address of a head and a worker node on loopback, with a core each; other clusters are left alone.
+
+    Without tokens: Ray's nodes would ask for one where an earlier cluster left it in the home folder, and its clients
+    not bring it.
+    """
     ray = str(Path(sys.executable).parent / "ray")
     node = ("--block", "--node-ip-address=127.0.0.1", "--num-cpus=1", "--disable-usage-stats")
     with socket.socket() as free:
@@ -41,7 +45,8 @@ def cluster() -> Iterator[str]:
         port = free.getsockname()[1]
     address = f"127.0.0.1:{port}"
     # Not pytest's own folder: the names of sockets may not be long.
-    with tempfile.TemporaryDirectory() as place, contextlib.ExitStack() as nodes:
+    with tempfile.TemporaryDirectory() as place, contextlib.ExitStack() as nodes, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_AUTH_MODE", "disabled")
         begun = (
             ("--head", f"--port={port}", "--include-dashboard=false", f"--temp-dir={place}"),
             (f"--address={address}",),
