@@ -74,11 +74,11 @@ class Trial:
         # The first evaluation with anything learned says little yet.
         study = opened(self.out, self.number, self.config.agent.random_steps + self.config.schedule.evaluate_every)
         trial = self._begun(study)
+        values = {search.name: search.suggest(trial, self.config.agent) for search in self.searches}
         if study.trials[trial.number].state.is_finished():  # told, but its process died before it wrote the note
             ended = study.trials[trial.number].state.name
             state: State = "complete" if ended == "COMPLETE" else "pruned" if ended == "PRUNED" else "failed"
-            return self._write(trial.number, self.note()["settings"], state)
-        values = {search.name: search.suggest(trial, self.config.agent) for search in self.searches}
+            return self._write(trial.number, values, state)
         self._write(trial.number, values, "running")
         try:
             agent = dataclasses.replace(self.config.agent, **values)
@@ -107,11 +107,13 @@ class Trial:
             self._write(trial.number, values, "pruned")
 
     def _begun(self, study: Any) -> Any:
-        """A new trial, or the one that a process began which died."""
-        known = self.note().get("trial")
-        if not isinstance(known, int) or known >= len(study.trials):
-            return study.ask()
-        return _optuna().trial.Trial(study, study.trials[known]._trial_id)
+        """A new trial, or the one that a process began which died; the journal knows whose it is."""
+        for known in study.trials:
+            if known.user_attrs.get("piece") == self.number:
+                return _optuna().trial.Trial(study, known._trial_id)
+        trial = study.ask()
+        trial.set_user_attr("piece", self.number)
+        return trial
 
     def _write(self, number: int, values: dict[str, Any], state: State) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)

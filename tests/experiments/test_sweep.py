@@ -146,6 +146,16 @@ def test_a_journal_whose_last_line_was_torn_goes_on(here: None, tmp_path: Path) 
 
 
 @extras
+def test_a_trial_whose_note_is_damaged_is_not_told_twice(here: None, tmp_path: Path) -> None:
+    begin(tmp_path, trials=3)
+    rows = table(tmp_path)
+    (tmp_path / "trial-001" / "trial.json").write_text('{"trial"')
+    said = begin(tmp_path, trials=3)
+    assert table(tmp_path) == rows and len(module.opened(tmp_path).trials) == 3
+    assert said[0].startswith("3 of 3 trials completed")
+
+
+@extras
 def test_a_sweep_that_lost_its_journal_or_its_plan_says_so(here: None, tmp_path: Path) -> None:
     begin(tmp_path, trials=1)
     (tmp_path / module.JOURNAL).rename(tmp_path / "kept")
