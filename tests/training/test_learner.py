@@ -109,7 +109,7 @@ def test_each_of_several_seeds_learns_what_it_would_learn_alone_to_the_last_bit(
 
 
 @pytest.mark.parametrize(
-    "name", ["td3", "pets", *(pytest.param(name, marks=pytest.mark.slow) for name in ("sac", "mbpo", "mbdpg"))]
+    "name", ["td3", *(pytest.param(name, marks=pytest.mark.slow) for name in ("sac", "pets", "mbpo", "mbdpg"))]
 )
 def test_all_seeds_under_one_vmap_learn_what_each_learns_alone_but_for_rounding(
     name: str, monkeypatch: pytest.MonkeyPatch
