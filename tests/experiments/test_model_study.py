@@ -79,7 +79,7 @@ def test_a_fit_leaves_the_errors_of_its_model(
     fit(lambda: False)
     assert fit.finished() and out.read_text().startswith("depth,rmse,persistence\n1,")
     whole = out.read_bytes()
-    for part in (b"", whole[: len(whole) // 2], whole[:-3], whole.rsplit(b"\r\n", 2)[0] + b"\r\n"):
+    for part in (b"", whole[: len(whole) // 2], whole[:-3], whole.rsplit(b"\n", 2)[0] + b"\n"):
         out.write_bytes(part)  # a part of it was drawn as if it were all
         assert not fit.finished()
     out.write_bytes(whole)
