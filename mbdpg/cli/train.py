@@ -70,12 +70,10 @@ def run_flags(verb: str, purpose: str, options: type[Any], args: list[str]) -> A
     schedule, env_options = presets.run_settings(preset)
     agent = presets.agent_config(algorithm, preset, args[0] if args else None)
     flat: Any = tyro.conf.OmitArgPrefixes
-    known = {field.name for kind in (options, Schedule, EnvOptions, type(agent)) for field in dataclasses.fields(kind)}
+    known = set[str]().union(*map(_names, (options, Schedule, EnvOptions, type(agent))))
     for flag in (arg.partition("=")[0] for arg in args if arg.startswith("--")):
         name = flag[2:].replace("-", "_").removeprefix("no_")
-        others = [
-            other for other, kind in CONFIGS.items() if name in {field.name for field in dataclasses.fields(kind)}
-        ]
+        others = [other for other, kind in CONFIGS.items() if name in _names(kind)]
         wrong = f"{flag} is no setting of {algorithm}, but of {' and '.join(others)}"
         require(name in known or not others, f"{wrong}; see mbdpg {verb} --algorithm {algorithm} --help")
 
@@ -97,6 +95,11 @@ def run_flags(verb: str, purpose: str, options: type[Any], args: list[str]) -> A
     flags = told(agent)
     own = presets.agent_config(algorithm, preset, flags.env)
     return flags if own == agent else told(own)  # where the task's id stands elsewhere
+
+
+def _names(kind: type[Any]) -> set[str]:
+    """Of a dataclass's fields."""
+    return {field.name for field in dataclasses.fields(kind)}
 
 
 def default_folder(parent: str, config: RunConfig) -> Path:
