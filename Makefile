@@ -39,7 +39,7 @@ test: setup-dev
 	@$(BIN)/python -m pytest -q -n $(WORKERS) $(ARGS)
 
 test-slow: setup-dev
-	@$(BIN)/python -m pytest -q -m slow --timeout 3600 $(ARGS)
+	@XLA_FLAGS= $(BIN)/python -m pytest -q -m slow --timeout 3600 $(ARGS)
 
 test-extras: $(VENV)/.installed-extras
 	@$(BIN)/python -m pytest -q -m extras --timeout 600 $(ARGS)

@@ -15,7 +15,9 @@ os.environ.setdefault("MPLBACKEND", "agg")
 for library in ("OMP", "OPENBLAS", "MKL"):  # pytest-xdist already uses every core
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
-os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")  # compiling is most of what small networks cost
+# Compiling is most of what small networks cost; without fusion emitters a large program takes half the time.
+os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
 
 from jaxtyping import install_import_hook
 
@@ -75,7 +77,6 @@ def mbdpg_command(tmp_path_factory: pytest.TempPathFactory) -> Mbdpg:
     cache = tmp_path_factory.getbasetemp() / "compiled"
     environment = os.environ | {
         "PYTHONPATH": str(ROOT),
-        "XLA_FLAGS": "--xla_cpu_use_fusion_emitters=false",  # half the time to compile a large program
         "JAX_COMPILATION_CACHE_DIR": str(cache),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "0",
