@@ -471,6 +471,19 @@ def test_a_stranger_s_run_does_not_write_control_characters_to_the_terminal(say:
     assert said.out.splitlines()[0] == r"Pendulum\x1b[31m-v1"
 
 
+def test_a_damaged_run_is_left_out_of_the_report_and_named(say: Any, toys: None) -> None:
+    """It kept the others from being shown."""
+    for seed in ("0", "1"):
+        assert say("train", "Pendulum-v1", *TINY, "--seeds", seed, "--out", f"runs/{seed}").status == 0
+    Path("runs/0/seed-0/config.json").write_text("{")
+    said = say("report", "runs", "--out", "page.html")
+    assert said.status == 0, said.err
+    lines = said.out.splitlines()
+    assert lines[0].startswith("left out: ") and "runs/0/seed-0" in lines[0] and lines[3].startswith("  td3 (1 run): ")
+    assert '"left_out"' in (page := Path("page.html").read_text()) and "runs/0/seed-0" in page
+    check_refused(say("report", "runs/0"), "no run is left to report")
+
+
 def test_report_without_a_common_step_is_refused_but_for_its_page(say: Any, toys: None) -> None:
     for seed in ("0", "1"):
         assert say("train", "Pendulum-v1", *TINY, "--seeds", seed, "--out", f"runs/{seed}").status == 0

@@ -10,9 +10,10 @@ import tyro
 
 from mbdpg.cli.flags import parse
 from mbdpg.interfaces import require
-from mbdpg.reports.comparison import NO_COMMON_STEP, grouped, run_folders, table
-from mbdpg.reports.contents import contents, read_environments
+from mbdpg.reports.comparison import NO_COMMON_STEP, run_folders, table
+from mbdpg.reports.contents import compared, contents
 from mbdpg.reports.page import check_place, write_page
+from mbdpg.reports.record import read_records
 
 
 @dataclass(frozen=True)
@@ -35,12 +36,21 @@ def report(args: list[str]) -> None:
     require(len(flags.runs) > 0, "no run was given; expected run folders, or a folder that holds some")
     if flags.out is not None:
         check_place(flags.out)
-    environments = read_environments(grouped(run_folders(flags.runs)), at=flags.at)
+    left_out: list[str] = []
+    runs = read_records(run_folders(flags.runs), leave_out=left_out.append)
+    for reason in left_out:
+        print(_harmless(f"left out: {reason}"))
+    require(len(runs) > 0, "no run is left to report")
+    environments = compared(runs, at=flags.at)
     for environment in environments:
         # Without a common step the page still has the curves, and says what is missing.
         lines = table(environment.rows) if environment.rows or flags.out is None else [NO_COMMON_STEP]
-        # A run may be a stranger's: nothing in it is to move the terminal's cursor.
-        print("\n".join(line if line.isprintable() else repr(line)[1:-1] for line in (environment.name, *lines)))
+        print("\n".join(map(_harmless, (environment.name, *lines))))
     if flags.out is not None:
-        write_page(flags.out, contents(environments))
+        write_page(flags.out, contents(environments, left_out))
         print(f"page with curves, settings and more: {flags.out}")
+
+
+def _harmless(line: str) -> str:
+    """A run may be a stranger's: nothing in it is to move the terminal's cursor."""
+    return line if line.isprintable() else repr(line)[1:-1]

@@ -15,6 +15,7 @@ from mbdpg.experiments.studies import RECORDED, SCALES, Cell, Model, Scale, Scal
 from mbdpg.experiments.work import Demonstrating, Training
 from mbdpg.interfaces import require
 from mbdpg.reports.figures import Curves, Errors, write_figure
+from mbdpg.reports.record import Record
 from mbdpg.storage.run_folder import only_writer
 
 
@@ -124,7 +125,8 @@ def _draw(chosen: Study, scale: Scale, out: Path, say: Callable[[str], None]) ->
             }
             panels.append(Errors(panel.title, {label: found for label, found in files.items() if found}))
         else:
-            runs = {cell.label: _training(cell, scale.seeds, scale, out).begun() for cell in panel.cells}
+            begun = {cell.label: _training(cell, scale.seeds, scale, out).begun() for cell in panel.cells}
+            runs = {label: [Record.read(run, root=out) for run in found] for label, found in begun.items()}
             panels.append(Curves(panel.title, {label: found for label, found in runs.items() if found}))
     for line in write_figure(chosen.name, panels, out, as_hours=chosen.as_hours):
         say(line)

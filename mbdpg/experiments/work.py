@@ -13,7 +13,7 @@ from mbdpg.experiments import expert
 from mbdpg.experiments.compilations import keep_compilations
 from mbdpg.experiments.config import RunConfig
 from mbdpg.experiments.run import OnUpdate, resume, train
-from mbdpg.interfaces import require
+from mbdpg.interfaces import UserError, require
 from mbdpg.storage.files import replace_durably
 from mbdpg.storage.metrics import read_metrics
 from mbdpg.storage.run_folder import RunFolder, discard_unbegun
@@ -36,9 +36,7 @@ class Training:
 
     def finished(self) -> bool:
         """Whether every seed has all its steps and its last evaluation, with these settings."""
-        return all(
-            steps_evaluated(run) >= self.config.schedule.steps and _is_of(run, self.config) for run in self.runs()
-        )
+        return all(self._has(run, self.config.schedule.steps) for run in self.runs())
 
     def __call__(self, should_stop: Callable[[], bool], on_update: OnUpdate = lambda update: None) -> None:
         """Begin, or go on where it was.
@@ -62,11 +60,18 @@ class Training:
 
     def begun(self) -> list[Path]:
         """Run folders with these settings that have something to show."""
-        return [run for run in self.runs() if steps_evaluated(run) > 0 and _is_of(run, self.config)]
+        return [run for run in self.runs() if self._has(run, 1)]
 
     def runs(self) -> list[Path]:
         """All run folders, begun or not."""
         return [self.out / f"seed-{seed}" for seed in self.seeds]
+
+    def _has(self, run: Path, steps: int) -> bool:
+        """Whether a run with these settings was evaluated at so many steps or more; not a damaged one."""
+        try:
+            return steps_evaluated(run) >= steps and _is_of(run, self.config)
+        except UserError:  # going on with it says what is wrong
+            return False
 
 
 @final

@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from mbdpg.interfaces import require
-from mbdpg.reports.record import Curve
+from mbdpg.reports.record import Curve, Record
 from mbdpg.reports.statistics import Summary, probability_of_improvement, summarize
-from mbdpg.storage.run_folder import RunFolder
 
 LOOKS_ON = {"steps", "evaluate_every", "evaluation_episodes", "log_every", "checkpoint_every"}
 """Settings that change nothing of what is learned at a step."""
@@ -44,12 +43,12 @@ def run_folders(paths: Sequence[Path]) -> list[Path]:
     return found
 
 
-def grouped(runs: Sequence[Path]) -> dict[str, dict[str, list[Path]]]:
-    """Runs of the same settings: for each environment, folders by a label that tells groups apart."""
-    groups: dict[str, dict[str, list[Path]]] = defaultdict(lambda: defaultdict(list))
+def grouped(runs: Sequence[Record]) -> dict[str, dict[str, list[Record]]]:
+    """Runs of the same settings: for each environment, those by a label that tells groups apart."""
+    groups: dict[str, dict[str, list[Record]]] = defaultdict(lambda: defaultdict(list))
     settings: dict[str, dict[str, Any]] = {}
     for run in runs:
-        config = RunFolder.open(run).config
+        config = run.config
         flat = {"algorithm": config.get("algorithm"), "demonstrations": config.get("demonstrations")}
         for part in ("agent", "env_options", "schedule"):
             values = config.get(part)
@@ -61,7 +60,7 @@ def grouped(runs: Sequence[Path]) -> dict[str, dict[str, list[Path]]]:
     return {env: _labelled(own, settings) for env, own in groups.items()}
 
 
-def _labelled(groups: dict[str, list[Path]], settings: dict[str, dict[str, Any]]) -> dict[str, list[Path]]:
+def _labelled(groups: dict[str, list[Record]], settings: dict[str, dict[str, Any]]) -> dict[str, list[Record]]:
     """Each group's algorithm, and those of its settings in which another group of that algorithm differs."""
     labels = {}
     for key, runs in groups.items():
@@ -116,7 +115,8 @@ def table(rows: Sequence[Row]) -> list[str]:
         UserError: there is no row.
     """
     require(bool(rows), NO_COMMON_STEP)
-    names = "mean ± std, interquartile mean [95 % interval]"
+    several = any(row.summary.seeds > 1 for row in rows)
+    names = "mean ± std, interquartile mean [95 % interval]" if several else "of one run"
     names += f", and how often {best_of(rows)} is better" if len(rows) > 1 else ""
     lines = [f"return at {rows[0].steps[1]:,} steps: {names}"]
     for row in rows:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mbdpg.reports.comparison import NO_COMMON_STEP, Row, compare, compare_last
+from mbdpg.reports.comparison import NO_COMMON_STEP, Row, compare, compare_last, grouped
 from mbdpg.reports.diagnostics import RETURN, diagnostics, series_of
 from mbdpg.reports.differences import differences, machine
 from mbdpg.reports.record import Record, number
@@ -33,30 +33,28 @@ class Environment(NamedTuple):
     """What the groups reached at the same step; empty if there is none."""
 
 
-def read_environments(groups: Mapping[str, Mapping[str, Sequence[Path]]], *, at: int | None) -> list[Environment]:
-    """Read and compare runs.
+def compared(runs: Sequence[Record], *, at: int | None) -> list[Environment]:
+    """The environments of runs, and what was reached there.
 
     Args:
-        groups: run folders by environment and by label.
+        runs: of any settings.
         at: environment steps, as for `compare`.
 
     Raises:
-        UserError: a run is damaged or has no rows yet, or `at` is no step at which all were evaluated.
+        UserError: `at` is no step at which all were evaluated.
     """
-    runs = [run for own in groups.values() for folders in own.values() for run in folders]
-    root = Path(os.path.commonpath([run.absolute().parent for run in runs]))
     environments = []
-    for env, own in groups.items():
-        records = {label: [Record.read(run, root=root) for run in runs] for label, runs in own.items()}
-        curves = {label: [run.curve for run in runs] for label, runs in records.items()}
-        environments.append(Environment(env, records, compare(curves, at=at)))
+    for env, groups in grouped(runs).items():
+        curves = {label: [run.curve for run in own] for label, own in groups.items()}
+        environments.append(Environment(env, groups, compare(curves, at=at)))
     return environments
 
 
-def contents(environments: Sequence[Environment]) -> Content:
-    """Everything on the page."""
+def contents(environments: Sequence[Environment], left_out: Sequence[str] = ()) -> Content:
+    """Everything on the page; `left_out` says of runs that are not there why."""
     runs = [run for environment in environments for own in environment.groups.values() for run in own]
-    return {"environments": [_environment(own) for own in environments], "videos": videos(runs)}
+    missing = _table("Left out", ["why"], [[reason] for reason in left_out])
+    return {"left_out": missing, "environments": [_environment(own) for own in environments], "videos": videos(runs)}
 
 
 def videos(runs: Sequence[Record]) -> list[Content]:

@@ -42,8 +42,8 @@ class Curves:
     """Learning curves of a task."""
 
     title: str
-    runs: Mapping[str, Sequence[Path]]
-    """Run folders by label."""
+    runs: Mapping[str, Sequence[Record]]
+    """By label."""
 
     def evaluations(self) -> dict[str, list[list[Evaluation]]]:
         """Of every run, by label."""
@@ -66,13 +66,10 @@ class Errors:
         }
 
 
-def evaluations(run: Path) -> list[Evaluation]:
+def evaluations(run: Record) -> list[Evaluation]:
     """A run's evaluations but those in which every episode failed."""
-    record = Record.read(run, root=run.parent)
-    hours, experts = record.hours(), dict(zip(record.steps, record.column("expert_env_steps"), strict=True))
-    return [
-        Evaluation(step, int(experts[step] or 0), mean, hours.get(step, 0.0)) for step, mean in record.curve.items()
-    ]
+    hours, experts = run.hours(), dict(zip(run.steps, run.column("expert_env_steps"), strict=True))
+    return [Evaluation(step, int(experts[step] or 0), mean, hours.get(step, 0.0)) for step, mean in run.curve.items()]
 
 
 def write_figure(name: str, panels: Sequence[Curves | Errors], out: Path, *, as_hours: bool = False) -> list[str]:
@@ -86,8 +83,9 @@ def write_figure(name: str, panels: Sequence[Curves | Errors], out: Path, *, as_
         if isinstance(panel, Curves):
             groups = panel.evaluations()
             for label, runs in groups.items():
-                for path, run in zip(panel.runs[label], runs, strict=True):
-                    rows += [(panel.title, label, path.name.removeprefix("seed-"), *one, *[""] * 3) for one in run]
+                for record, run in zip(panel.runs[label], runs, strict=True):
+                    seed = record.folder.name.removeprefix("seed-")
+                    rows += [(panel.title, label, seed, *one, *[""] * 3) for one in run]
             lines += [panel.title, *(_hours(groups) if as_hours else _returns(groups))]
         else:
             lines += [f"{panel.title}: error after {', '.join(map(str, DEPTHS))} steps, persistence's last"]

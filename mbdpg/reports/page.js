@@ -109,6 +109,7 @@ function begin() {
   const counts = [plural(groups.flatMap((group) => group.runs).length, "run"), plural(groups.length, "group"), plural(content.environments.length, "environment")];
   document.querySelector("main").replaceChildren(
     element("header", {}, element("h1", {}, "mbdpg report"), element("p", { class: "muted" }, counts.join(" · "))),
+    ...titled(content.left_out, []),
     ...content.environments.map(section),
     ...(content.videos.length ? [element("section", {}, element("h2", {}, "Videos"), element("div", { class: "small" }, ...content.videos.map(film)))] : []));
 }

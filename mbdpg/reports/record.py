@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from mbdpg.interfaces import UserError
 from mbdpg.storage.metrics import read_metrics
 from mbdpg.storage.run_folder import RunFolder
 
@@ -92,6 +93,24 @@ class Record(NamedTuple):
             if skipped := max((value or 0 for value in numbers(self.training, name)), default=0):
                 found.append(f"{math.ceil(skipped):,} or more {name.removesuffix('/skipped')} updates skipped")
         return found
+
+
+def read_records(folders: Sequence[Path], *, leave_out: Callable[[str], None]) -> list[Record]:
+    """Read runs, each called by its path from the folder that holds them all.
+
+    Args:
+        folders: of the runs.
+        leave_out: called with what is wrong with each that cannot be read.
+    """
+    if not folders:
+        return []
+    root, found = Path(os.path.commonpath([folder.absolute().parent for folder in folders])), []
+    for folder in folders:
+        try:
+            found.append(Record.read(folder, root=root))
+        except UserError as error:
+            leave_out(str(error))
+    return found
 
 
 def learning_curve(folder: Path) -> Curve:

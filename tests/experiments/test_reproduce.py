@@ -100,6 +100,19 @@ def test_a_run_with_other_settings_is_not_taken_for_the_studys(launched: list[st
         work(lambda: False)
 
 
+@pytest.mark.parametrize("name", ["config.json", "metrics.jsonl"])
+def test_a_damaged_run_fails_alone_and_is_left_as_it_is(launched: list[str], tmp_path: Path, name: str) -> None:
+    """Nothing of the study could be done."""
+    begin(tmp_path, seeds=[0])
+    damaged = tmp_path / "Pendulum-v1" / "td3" / "seed-0" / name
+    damaged.write_text("{}\n" * 2)
+    with pytest.raises(UserError, match="1 of 4 failed"):
+        begin(tmp_path)
+    assert damaged.read_text() == "{}\n" * 2
+    found = {(row["label"], row["seed"]) for row in numbers(tmp_path)}
+    assert found == {("td3", "1"), ("td3 width=5", "0"), ("td3 width=5", "1")}
+
+
 def test_an_expert_without_success_fails_alone(launched: list[str], tmp_path: Path, monkeypatch: Any) -> None:
     taught = dataclasses.replace(cell("td3 taught"), demonstrated=True)
     study = dataclasses.replace(STUDY, panels=(Panel("demonstrations", (cell("td3"), taught)),))

@@ -7,7 +7,7 @@ import pytest
 
 from mbdpg.interfaces import UserError
 from mbdpg.reports.comparison import compare, compare_last, grouped, run_folders, table
-from mbdpg.reports.record import Curve, learning_curve
+from mbdpg.reports.record import Curve, learning_curve, read_records
 
 Make = Callable[..., Path]
 
@@ -25,7 +25,9 @@ def test_runs_are_grouped_by_everything_but_their_seed_and_named_by_what_differs
     wide = make(tmp_path / "wide", {0: 1.0}, width=16)
     sac = make(tmp_path / "sac", {0: 1.0}, algorithm="sac", width=99)
     other = make(tmp_path / "other", {0: 1.0}, env="F-v0")
-    assert grouped([*same, wide, sac, other]) == {
+    groups = grouped(read_records([*same, wide, sac, other], leave_out=pytest.fail))
+    folders = {env: {label: [run.folder for run in runs] for label, runs in own.items()} for env, own in groups.items()}
+    assert folders == {
         "E-v0": {"td3 width=8": same, "td3 width=16": [wide], "sac": [sac]},
         "F-v0": {"td3": [other]},
     }
@@ -43,6 +45,8 @@ def test_the_table_is_of_the_last_step_that_all_share(tmp_path: Path, make: Make
     assert lines[0].startswith("return at 100 steps: ") and lines[0].endswith("how often good is better")
     assert lines[1] == "  good (2 runs): 20.5 ± 0.7, 20.5 [20.0, 21.0]"
     assert lines[2] == "  bad (1 run): 20.5, 50%"
+    single = table(compare(curves({"bad": bad})))
+    assert single == ["return at 100 steps: of one run", "  bad (1 run): 20.5"]
     assert table(compare(both, at=50))[1].startswith("  good (2 runs): 10.5")
     with pytest.raises(UserError, match="--at is 150, expected a step at which all were evaluated: 0, 50, 100"):
         compare(both, at=150)

@@ -9,19 +9,20 @@ import numpy as np
 import pytest
 
 from mbdpg.reports.figures import Curves, Errors, evaluations, write_figure
+from mbdpg.reports.record import Record
 from mbdpg.storage.metrics import MetricsLog
 from mbdpg.storage.run_folder import RunFolder
 
 
-def make(path: Path, returns: dict[int, float | None], *, seconds: tuple[float, ...] = (), expert: int = 0) -> Path:
-    """A run folder with these evaluations."""
+def make(path: Path, returns: dict[int, float | None], *, seconds: tuple[float, ...] = (), expert: int = 0) -> Record:
+    """A run with these evaluations."""
     RunFolder.create(path, {"env": "E-v0", "algorithm": "td3", "agent": {}, "seed": 0})
     log = MetricsLog(path)
     for i, (step, value) in enumerate(returns.items()):
         row = {"expert_env_steps": expert, "time/seconds": seconds[i] if seconds else 0.0}
         log.write("eval", step, row if value is None else row | {"eval/return_mean": value})
     log.close()
-    return path
+    return Record.read(path, root=path.parent)
 
 
 def errors(path: Path, scale: float) -> Path:

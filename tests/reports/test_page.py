@@ -15,9 +15,10 @@ import pytest
 
 from mbdpg.interfaces import UserError
 from mbdpg.reports import contents as contents_module
-from mbdpg.reports.comparison import grouped, run_folders
-from mbdpg.reports.contents import contents, read_environments
+from mbdpg.reports.comparison import run_folders
+from mbdpg.reports.contents import compared, contents
 from mbdpg.reports.page import check_place, page, write_page
+from mbdpg.reports.record import read_records
 
 Make = Callable[..., Path]
 ROOT = Path(__file__).resolve().parents[2]
@@ -25,7 +26,7 @@ HOSTILE = "</script><img src=x onerror=alert(1)><!--\u2028$data&amp;"
 
 
 def content_of(*paths: Path, at: int | None = None) -> dict[str, Any]:
-    return contents(read_environments(grouped(run_folders(paths)), at=at))
+    return contents(compared(read_records(run_folders(paths), leave_out=pytest.fail), at=at))
 
 
 def data_in(html: str) -> dict[str, Any]:

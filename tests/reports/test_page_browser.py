@@ -15,9 +15,10 @@ from typing import Any
 import pytest
 from websockets.sync.client import connect
 
-from mbdpg.reports.comparison import grouped, run_folders
-from mbdpg.reports.contents import contents, read_environments
+from mbdpg.reports.comparison import run_folders
+from mbdpg.reports.contents import compared, contents
 from mbdpg.reports.page import write_page
+from mbdpg.reports.record import read_records
 
 pytestmark = pytest.mark.browser
 
@@ -183,7 +184,8 @@ def shown(tmp_path: Path, make: Callable[..., Path]) -> Path:
     make(tmp_path / "b", {step: 500.0 if step != 300 else float("nan") for step in steps}, algorithm="sac")
     make(tmp_path / "c", {0: 1.0, 1000: 2.0}, algorithm=HOSTILE, note="word" * 60)
     (tmp_path / "b" / "film.mp4").write_bytes(b"no film")
-    write_page(tmp_path / "page.html", contents(read_environments(grouped(run_folders([tmp_path])), at=None)))
+    runs = read_records(run_folders([tmp_path]), leave_out=pytest.fail)
+    write_page(tmp_path / "page.html", contents(compared(runs, at=None), [f"d: {HOSTILE}"]))
     return tmp_path / "page.html"
 
 
@@ -192,7 +194,8 @@ def test_it_loads_in_silence_and_asks_nothing_of_the_network(browser: Browser, s
     assert browser.errors == []
     assert {url for url in browser.requests if not url.startswith("data:")} == {shown.as_uri()}
     assert browser.get("document.querySelectorAll('path.mean').length") == 3 + 1 + 2  # return, error, critic
-    assert HOSTILE in browser.get("document.body.innerText") and browser.get("document.images.length") == 0
+    text = browser.get("document.body.innerText")
+    assert HOSTILE in text and f"d: {HOSTILE}" in text and browser.get("document.images.length") == 0
 
 
 def test_its_policy_stops_whatever_would_go_out(browser: Browser, shown: Path) -> None:
@@ -297,6 +300,6 @@ def test_nothing_is_wider_than_the_window(browser: Browser, shown: Path, width: 
 
 
 def test_a_page_without_a_run_says_so_quietly(browser: Browser, tmp_path: Path) -> None:
-    write_page(tmp_path / "page.html", {"environments": [], "videos": []})
+    write_page(tmp_path / "page.html", contents([]))
     browser.open(tmp_path / "page.html")
     assert browser.errors == [] and "0 runs" in browser.get("document.body.innerText")

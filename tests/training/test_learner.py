@@ -88,7 +88,7 @@ class Two(NamedTuple):
 
 
 MAKERS = {"td3": make_td3, "sac": make_sac, "pets": make_pets, "mbpo": make_mbpo, "mbdpg": make_mbdpg}
-# The slow ones compile as a user's program does: the quick compiler of the default tests rounds a loop's last bit apart.
+# The slow ones compile as a user's program does; the quick compiler of the default tests rounds a last bit apart.
 SLOW = ("td3", "sac", "mbpo", "mbdpg")
 LEARNERS = ["toy", "pets", *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)]
 
