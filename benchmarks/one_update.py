@@ -33,13 +33,11 @@ def compare(algorithm: str, peers: Path) -> str:
 
     env = EnvSpec("HalfCheetah-v5", OBSERVATION, ACTION, episode_limit=1000, reference_return=None)
     config: Any = agent_config(algorithm, "paper")
+    agent: Any = td3.TD3(config, env) if algorithm == "td3" else sac.SAC(config, env)
     keys = [jax.random.key(update) for update in range(UPDATES)]
-    if algorithm == "td3":  # the peer's target noise has no seed of its own
-        agent: Any = td3.TD3(td3.Config(**vars(config) | {"target_noise": 0.0}), env)
-    else:
-        agent = sac.SAC(config, env)
-    # In the order in which the peer draws: at this step's observation, then at the next one's.
-    noise = [jax.random.normal(k, (BATCH, ACTION)) for key in keys for k in jax.random.split(key)[::-1]]
+    # TD3 draws at the next observation; SAC, in the peer's order, at this step's and then at the next one's.
+    draws = [[key] if algorithm == "td3" else jax.random.split(key)[::-1] for key in keys]
+    noise = [jax.random.normal(key, (BATCH, ACTION)) for own in draws for key in own]
     with tempfile.TemporaryDirectory() as place:
         given, found = Path(place) / "given.npz", Path(place) / "found.npz"
         np.savez(given, noise=np.stack(noise))
@@ -112,10 +110,12 @@ def peer(algorithm: str, given: Path, found: Path) -> None:
     def rsample(self: torch.distributions.Normal, sample_shape: Any = ()) -> torch.Tensor:
         return self.loc + self.scale * noise.pop(0)
 
+    def normal_(self: torch.Tensor, mean: float, std: float) -> torch.Tensor:
+        return self.copy_(mean + std * noise.pop(0))
+
     torch.distributions.Normal.rsample = rsample
     agent: Any = make_agent(algorithm, Spaces(), 0, None)
     agent.set_logger(Logger(folder=None, output_formats=[]))
-    agent.target_policy_noise = 1e-12
     with torch.no_grad():  # targets that differ from what they follow
         for parameter in agent.critic_target.parameters():
             parameter += 0.01 * torch.randn_like(parameter)
@@ -137,7 +137,9 @@ def peer(algorithm: str, given: Path, found: Path) -> None:
         return {f"{when}/{name}": value.detach().numpy().copy() for name, value in agent.policy.state_dict().items()}
 
     before = state("before")
+    torch.Tensor.normal_ = normal_  # TD3's draws; networks and targets have had theirs
     agent.train(gradient_steps=UPDATES, batch_size=BATCH)
+    assert not noise, "the peer drew less than ours"
     after = state("after")
     if algorithm == "sac":
         after["after/temperature"] = agent.log_ent_coef.detach().numpy()[0]

@@ -21,7 +21,7 @@ from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
 
-RANDOM_STEPS = {"td3": 25_000, "sac": 1000}
+RANDOM_STEPS = {"td3": 25_000, "sac": 10_000}
 CYCLE = 50
 """Environment steps between rounds of as many updates, as in `mbdpg train`."""
 

@@ -177,7 +177,7 @@ class MBPO:
     def imagine(self, state: State, batch: Batch, *, key: PRNGKeyArray) -> tuple[State, Metrics]:
         """Roll the actor out in the elites from real states, and keep one step of each rollout, all equally likely.
 
-        A rollout that ends begins again where it began.
+        In the place of one that ends another goes on, from where a third began.
         """
         start = batch.observation[:, 0]
         elites = state.world.elites(self.config.elites)
@@ -198,7 +198,8 @@ class MBPO:
             new = Transition(observation, action, reward, after, ends.astype(jnp.float32))
             now = wanted == t
             kept = jax.tree.map(lambda n, k: jnp.where(now.reshape(-1, *[1] * (n.ndim - 1)), n, k), new, kept)
-            return jnp.where(ends[:, None], start, after), kept
+            # Not where it began itself: what is about to end there would be kept far more often than it happens.
+            return jnp.where(ends[:, None], jnp.roll(start, t + 1, axis=0), after), kept
 
         nothing = jax.tree.map(lambda x: jnp.zeros((start.shape[0], *x.shape[1:])), state.imagined.rows)
         _, kept = jax.lax.fori_loop(0, state.rollout_length, step, (start, nothing))

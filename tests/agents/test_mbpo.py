@@ -169,12 +169,25 @@ def test_actions_are_drawn() -> None:
     assert (jnp.abs(rows.action) < 1).all() and np.abs(rows.action - center(start)).max() > 0.1
 
 
-def test_a_rollout_begins_again_where_it_ended() -> None:
+def test_where_a_rollout_ends_another_goes_on_from_another_start() -> None:
     ending = predictable().world.ensemble.members.output.bias.at[:, -1].set(-100.0)
     before = eqx.tree_at(lambda x: x.world.ensemble.members.output.bias, predictable(), ending)
-    rows, start = imagined(3, before)
-    np.testing.assert_array_equal(rows.observation, start)
-    assert (rows.terminated == 1).all()
+    rows, start = imagined(3, before, rollouts_per_step=8)
+    own, starts = np.asarray(rows.observation), np.asarray(start)
+    depths = [next(t for t in range(3) if (own[row] == starts[row - t]).all()) for row in range(len(own))]
+    assert set(depths) == {0, 1, 2} and (rows.terminated == 1).all()
+
+
+def test_starts_about_to_end_do_not_fill_the_buffer_with_ends() -> None:
+    """They began again where they had begun, and ended there at every step."""
+    still = jax.tree.map(jnp.zeros_like, predictable().world.ensemble.members.output)
+    before = eqx.tree_at(lambda x: x.world.ensemble.members.output, predictable(), still)
+    ant = EnvSpec("Ant-v5", O, A, None, None)
+    rows, start = imagined(8, before, ant, termination="known", rollouts_per_step=200)
+    ending = float(np.mean((start[:, 0] < 0.2) | (start[:, 0] > 1.0)))
+    # Nothing moves: at depth t those end that have ended at all depths before, each from a start of its own.
+    expected = np.mean([ending ** (t + 1) for t in range(8)])
+    assert abs(float(rows.terminated.mean()) - expected) < 0.05 < ending - expected
 
 
 def test_long_rollouts_leave_shallow_steps_as_often_as_deep_ones() -> None:

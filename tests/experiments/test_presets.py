@@ -97,7 +97,7 @@ def test_a_task_s_settings_are_of_registered_tasks_of_all_versions_and_differ_fr
 
 
 def test_the_rivals_have_their_authors_sizes_and_settings() -> None:
-    # Haarnoja et al. 2018b, Table 1; Fujimoto et al. 2018, as in their code since 2020.
+    # Haarnoja et al. 2018b, Table 1, and their last code's random steps; Fujimoto et al. 2018, as in their code since 2020.
     shared = {"layers": 2, "width": 256, "plain": True, "batch_size": 256, "learning_rate": 3e-4, "discount": 0.99}
     shared |= {"target_update_rate": 0.005, "updates_per_step": 1, "exploration_scatter": 0, "exploration_color": 0}
     own = {
@@ -110,7 +110,7 @@ def test_the_rivals_have_their_authors_sizes_and_settings() -> None:
         }
     }
     soft = {"entropy_per_action": -1, "initial_temperature": 1}
-    own |= {"sac": soft | {"random_steps": 1000}}
+    own |= {"sac": soft | {"random_steps": 10_000}}
     # Janner et al. 2019, Appendix C, and as in their code.
     own |= {
         "mbpo": soft
@@ -127,7 +127,7 @@ def test_the_rivals_have_their_authors_sizes_and_settings() -> None:
 def test_pets_has_its_authors_settings() -> None:
     # Chua et al. 2018 and kchua/handful-of-trials, HalfCheetah.
     expected = {"horizon": 30, "population": 500, "plan_elites": 50, "iterations": 5, "smoothing": 0.1, "members": 5}
-    expected |= {"model_width": 200, "model_learning_rate": 1e-3, "random_steps": 1000, "termination": "known"}
+    expected |= {"model_width": 200, "model_learning_rate": 1e-3, "random_steps": 1000, "termination": "learned"}
     config = agent_config("pets", "paper", "HalfCheetah-v5")
     assert {name: getattr(config, name) for name in expected} == expected
     assert config.particles * config.members == 20
