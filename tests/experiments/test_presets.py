@@ -97,7 +97,7 @@ def test_a_task_s_settings_are_of_registered_tasks_of_all_versions_and_differ_fr
 
 
 def test_the_rivals_have_their_authors_sizes_and_settings() -> None:
-    # Haarnoja et al. 2018b, Table 1, and their last code's random steps; Fujimoto et al. 2018, as in their code since 2020.
+    # Haarnoja et al. 2018b, Table 1, and Fujimoto et al. 2018; random steps as in the last code of both.
     shared = {"layers": 2, "width": 256, "plain": True, "batch_size": 256, "learning_rate": 3e-4, "discount": 0.99}
     shared |= {"target_update_rate": 0.005, "updates_per_step": 1, "exploration_scatter": 0, "exploration_color": 0}
     own = {
