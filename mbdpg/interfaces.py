@@ -196,7 +196,7 @@ class Phase(NamedTuple):
     after_steps: int
     sampling: Sampling
     first_updates: int = 0
-    """Gradient steps taken at once when `after_steps` have passed."""
+    """Gradient steps taken at once when `after_steps` have passed, rounded up to as many as one call takes."""
     update: Callable[..., tuple[Any, Metrics]] = lambda state, batch, *, key: (state, {})
     """update(state, batch, *, key) -> (state, metrics): pure, for one seed, traced by JAX."""
 

@@ -482,12 +482,20 @@ def test_a_damaged_run_is_left_out_of_the_report_and_named(say: Any, toys: None)
     assert lines[0].startswith("left out: ") and "runs/0/seed-0" in lines[0] and lines[3].startswith("  td3 (1 run): ")
     assert '"left_out"' in (page := Path("page.html").read_text()) and "runs/0/seed-0" in page
     check_refused(say("report", "runs/0"), "no run is left to report")
+    Path("runs/1/seed-1/metrics.jsonl").write_text("")  # of a run that has just begun
+    check_refused(say("report", "runs/1"), "no run is left to report")
+    assert "left out: runs/1/seed-1 has no evaluation with a return yet" in say("report", "runs/1").out
 
 
 def test_report_without_a_common_step_is_refused_but_for_its_page(say: Any, toys: None) -> None:
     for seed in ("0", "1"):
         assert say("train", "Pendulum-v1", *TINY, "--seeds", seed, "--out", f"runs/{seed}").status == 0
-    Path("runs/0/seed-0/metrics.jsonl").write_text("")
+    metrics = Path("runs/0/seed-0/metrics.jsonl")
+    late = [row for row in metrics.read_text().splitlines(keepends=True) if '"env_steps": 40' in row]
+    metrics.write_text("".join(late))
+    Path("runs/1/seed-1/metrics.jsonl").write_text(
+        Path("runs/1/seed-1/metrics.jsonl").read_text().replace('"env_steps": 40', '"env_steps": 41')
+    )
     check_refused(say("report", "runs"), "no evaluation at the same step")
     said = say("report", "runs", "--out", "page.html")
     assert said.status == 0 and "no evaluation at the same step" in said.out

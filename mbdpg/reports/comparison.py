@@ -90,9 +90,8 @@ def compare(curves: Mapping[str, Sequence[Curve]], *, at: int | None = None) -> 
 
 
 def compare_last(curves: Mapping[str, Sequence[Curve]]) -> list[Row]:
-    """What each group reached at the last evaluation of each of its runs; groups without any are left out."""
-    ends = {label: [max(curve.items()) for curve in own if curve] for label, own in curves.items()}
-    return _rows({label: own for label, own in ends.items() if own})
+    """What each group reached at the last evaluation of each of its runs, which all have one."""
+    return _rows({label: [max(curve.items()) for curve in own] for label, own in curves.items()})
 
 
 def _rows(points: Mapping[str, Sequence[tuple[int, float]]]) -> list[Row]:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mbdpg.interfaces import UserError
+from mbdpg.interfaces import UserError, require
 from mbdpg.storage.metrics import read_metrics
 from mbdpg.storage.run_folder import RunFolder
 
@@ -100,16 +100,19 @@ def read_records(folders: Sequence[Path], *, leave_out: Callable[[str], None]) -
 
     Args:
         folders: of the runs.
-        leave_out: called with what is wrong with each that cannot be read.
+        leave_out: called with what is wrong with each that cannot be read or has nothing to compare.
     """
     if not folders:
         return []
     root, found = Path(os.path.commonpath([folder.absolute().parent for folder in folders])), []
     for folder in folders:
         try:
-            found.append(Record.read(folder, root=root))
+            run = Record.read(folder, root=root)
+            require(bool(run.curve), f"{folder} has no evaluation with a return yet")
         except UserError as error:
             leave_out(str(error))
+        else:
+            found.append(run)
     return found
 
 

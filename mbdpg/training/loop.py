@@ -179,9 +179,10 @@ class Training:
         if phase.sampling.demonstrated and not self.collectors[0].replay.demonstrated:
             return True
         began, cycle, rate = time.monotonic(), self.schedule.cycle, phase.updates_per_step
-        due = phase.first_updates + int((self.env_steps - phase.after_steps) * rate)
         # At rate 0 nothing comes after the first updates, so calls of a size that leaves none of them over.
         chunk = max(1, round(rate * cycle)) if rate else math.gcd(phase.first_updates, cycle)
+        first = math.ceil(phase.first_updates / chunk) * chunk
+        due = first + int((self.env_steps - phase.after_steps) * rate)
         while (done := self._updates[phase.name]) + chunk <= due and not should_stop():
             batches = [
                 c.replay.sample(chunk, phase.sampling, random_stream(c.seed, phase.name, done)) for c in self.collectors

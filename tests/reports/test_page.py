@@ -82,12 +82,11 @@ def test_a_single_run_has_one_table_of_scores(tmp_path: Path, make: Make) -> Non
 def test_without_a_common_step_a_note_says_so_and_the_last_evaluations_remain(tmp_path: Path, make: Make) -> None:
     make(tmp_path / "a", {0: 1.0})
     make(tmp_path / "b", {5: 2.0})
-    make(tmp_path / "c", {0: None}, width=9)
     content = content_of(tmp_path)
     (own,) = content["environments"]
     assert "no evaluation at the same step" in own["note"]
     assert next(iter(tables_of(content))) == "Return at the last evaluation of each run"
-    assert own["scores"][0]["rows"] == [["td3 width=8", "0 – 5", "2", "1.5", "0.7", "1.5", "1.0 to 2.0"]]
+    assert own["scores"][0]["rows"] == [["td3", "0 – 5", "2", "1.5", "0.7", "1.5", "1.0 to 2.0"]]
 
 
 def test_wall_clock_is_compared_with_td3_at_the_same_step(tmp_path: Path, make: Make) -> None:

@@ -226,6 +226,12 @@ def test_first_updates_are_all_taken_though_they_are_not_a_multiple_of_anything(
     assert [count["clone"] for count in counts(Phase("clone", 0.0, 5, DRAW, 3), random_steps=5)] == [0, 3, 3, 3, 3]
 
 
+def test_few_first_updates_are_not_lost_before_others_that_come_many_at_once(counts: Any) -> None:
+    """An ensemble that had none planned and imagined untrained."""
+    found = counts(Phase("few", 1.0, 5, DRAW, 3), random_steps=5)
+    assert [count["few"] for count in found] == [0, 5, 10, 15, 20]
+
+
 def test_a_phase_that_begins_later_waits_with_its_first_updates_too(counts: Any) -> None:
     found = counts(Phase("late", 1.0, 10, DRAW, 5), random_steps=5)
     assert [count["late"] for count in found] == [0, 0, 5, 10, 15]
