@@ -77,6 +77,8 @@ TASKS: dict[str, dict[str, dict[str, dict[str, Any]]]] = {
     # more thing to know, and have their numbers in the notebook.
     "default": {
         "mbdpg": {
+            # 36: where imagination follows the mean and episodes explore widely, it jumps, falls and does not walk
+            "Ant": {"planning": "stochastic", "exploration_std": 0.1},
             "LunarLanderContinuous": {"trace": 1.0},  # 21: below 1 it hovers and never meets the ground
         },
         "mbpo": MBPO_TASKS,

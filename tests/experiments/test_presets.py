@@ -78,6 +78,8 @@ def test_a_task_of_its_own_settings_keeps_all_others() -> None:
     own = agent_config("mbdpg", "default", "LunarLanderContinuous-v3")
     assert own == mbdpg.Config(trace=1.0) == agent_config("mbdpg", "default", "LunarLanderContinuous-v2")
     assert agent_config("mbdpg", "default", "Hopper-v5") == mbdpg.Config()
+    quiet = {"planning": "stochastic", "exploration_std": 0.1}
+    assert agent_config("mbdpg", "default", "Ant-v5") == mbdpg.Config(**quiet)
     assert agent_config("mbdpg", "paper", "LunarLanderContinuous-v3") == agent_config("mbdpg", "paper")
     assert agent_config("td3", "default", "LunarLanderContinuous-v3") == td3.Config()
 
