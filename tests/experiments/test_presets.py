@@ -80,6 +80,8 @@ def test_a_task_of_its_own_settings_keeps_all_others() -> None:
     assert agent_config("mbdpg", "default", "Hopper-v5") == mbdpg.Config()
     quiet = {"planning": "stochastic", "exploration_std": 0.1}
     assert agent_config("mbdpg", "default", "Ant-v5") == mbdpg.Config(**quiet)
+    cheetah = agent_config("mbdpg", "default", "HalfCheetah-v4")
+    assert (cheetah.planning, cheetah.discount, cheetah.horizon) == ("stochastic", 0.98, 5)
     assert agent_config("mbdpg", "paper", "LunarLanderContinuous-v3") == agent_config("mbdpg", "paper")
     assert agent_config("td3", "default", "LunarLanderContinuous-v3") == td3.Config()
 

@@ -1,0 +1,128 @@
+"""What a run of MBDPG is limited by, asked of its newest checkpoint alone; nothing is written, no new step is taken.
+
+    python results/what_limits.py policy RUN [--updates 4000] [--fits-per-update 1] [--planning deterministic]
+    python results/what_limits.py model RUN --learned 36000 [--updates 3000] [--fit-length 5 --burn-in 1]
+
+`policy` goes on learning from the replay as it is. If the real return rises, updates were missing; if what the policy
+earns in the model rises and the real return does not, it exploits the model's errors; if neither does, it is at an
+optimum of this model, and needs another model or new steps. `model` trains the dynamics afresh on the first steps and
+tests them on those that came later, which is what they are needed for: episodes of policies that they have not seen.
+Other settings of the agent's than the run's are `mbdpg train`'s flags.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from mbdpg.agents.mbdpg import MBDPG, Config
+from mbdpg.dynamics.accuracy import DEPTHS
+from mbdpg.dynamics.fitting import open_loop_error
+from mbdpg.dynamics.imagination import imagine
+from mbdpg.experiments.compilations import keep_compilations
+from mbdpg.experiments.config import RunConfig
+from mbdpg.interfaces import Environment, Sampling, require
+from mbdpg.storage.checkpoint import load_checkpoint
+from mbdpg.storage.run_folder import RunFolder
+from mbdpg.training.evaluation import evaluate
+from mbdpg.training.learner import Learner
+from mbdpg.training.replay import Replay
+
+PER_CALL = 50
+SAY_EVERY = 1000
+RECENT = 6000
+"""Newest steps that imagination starts from."""
+DREAM = 200
+"""Imagined steps; rewards of the second half are compared with what an episode pays per step."""
+
+
+def policy(options: argparse.Namespace) -> None:
+    """Go on learning, the replay as it is."""
+    agent, env, replay, arrays = load(options)
+    learner, rng = Learner(agent, [0]), np.random.default_rng(0)
+    learner.restore([arrays])
+    phases = {phase.name: phase for phase in agent.phases}
+    improving, fitting = phases["improving"], phases["fitting"]
+    recent = rng.integers(replay.size - RECENT, replay.size, 256)
+    starts = replay.windows(recent, improving.sampling)
+    drawn = agent.config.planning == "stochastic"
+
+    @jax.jit
+    def dream(states: Any, key: Any) -> Any:
+        state = jax.tree.map(lambda leaf: leaf[0], states)
+        start = agent._start(state, agent.normalized(state, starts), key=key)
+        model, actor, key = state.average_dynamics, state.average_actor, key if drawn else None
+        imagined = imagine(model, state.scales, actor, start.observation, start.memory, horizon=DREAM, key=key)
+        return jnp.mean(imagined.rewards[DREAM // 2 :]) * state.return_scale
+
+    for done in range(0, options.updates + 1, PER_CALL):
+        if done % SAY_EVERY == 0:
+            played = evaluate(env, learner.policies()[0], range(1000, 1005))
+            paid = sum(played.returns) / sum(played.lengths)
+            dreamed = float(dream(learner.state, jax.random.key(done)))
+            says = f"return {np.mean(played.returns):7.0f}  per step {paid:6.3f}, in the model {dreamed:6.3f}"
+            print(f"{done:6,} updates  {says}", flush=True)
+        learner.update(improving, [replay.sample(PER_CALL, improving.sampling, rng)], done)
+        fits = round(PER_CALL * options.fits_per_update)
+        if fits > 0:
+            learner.update(fitting, [replay.sample(fits, fitting.sampling, rng)], done)
+    env.close()
+
+
+def model(options: argparse.Namespace) -> None:
+    """Train dynamics on the first steps, test them on the later ones."""
+    agent, env, replay, _ = load(options)
+    env.close()
+    rng, burn_in = np.random.default_rng(0), agent.config.burn_in
+    rows, start = np.arange(replay.size), replay.columns()["start"]
+    starts, episode = np.unique(start, return_inverse=True)
+    ends = np.append(starts[1:], replay.size)[episode]
+    later = np.flatnonzero((rows >= options.learned) & (rows + max(DEPTHS) <= ends))
+    tested = replay.windows(rng.choice(later, 1024), Sampling(1024, burn_in, max(DEPTHS)))
+    learner = Learner(agent, [0])
+    learner.prepare([replay.statistics(0.0)])
+    fitting = next(phase for phase in agent.phases if phase.name == "fitting")
+
+    @jax.jit
+    def measure(states: Any) -> Any:
+        state = jax.tree.map(lambda leaf: leaf[0], states)
+        window = agent.normalized(state, tested)
+        return open_loop_error(state.average_dynamics, state.scales, window, burn_in=burn_in)
+
+    began = time.perf_counter()
+    for done in range(PER_CALL, options.updates + 1, PER_CALL):
+        drawn = rng.integers(0, options.learned, (PER_CALL, fitting.sampling.batch_size))
+        learner.update(fitting, [replay.windows(drawn, fitting.sampling)], done)
+        if done % SAY_EVERY == 0:
+            found = np.asarray(measure(learner.state))[[depth - 1 for depth in DEPTHS], 0]
+            errors = " / ".join(f"{error:.3f}" for error in found)
+            print(f"{done:6,} updates  error after {DEPTHS} steps {errors}  {time.perf_counter() - began:.0f} s")
+
+
+def load(options: argparse.Namespace) -> tuple[MBDPG, Environment, Replay, dict[str, np.ndarray]]:
+    """The run's agent with other settings, its environment, its replay and the arrays of its newest checkpoint."""
+    config, checkpoint = RunConfig.from_json(RunFolder.open(options.run).config), load_checkpoint(options.run)
+    require(isinstance(config.agent, Config), f"{options.run} is of {config.algorithm}, expected mbdpg")
+    env = config.make_env()
+    agent = MBDPG(tyro.cli(Config, args=options.settings, default=cast(Config, config.agent)), env.spec)
+    return agent, env, Replay.from_columns(checkpoint.replay), checkpoint.arrays
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("question", choices=("policy", "model"))
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--updates", type=int, default=3000)
+    parser.add_argument("--fits-per-update", type=float, default=0.0)
+    parser.add_argument("--learned", type=int, default=0, help="environment steps that the dynamics learn from")
+    keep_compilations()
+    asked, settings = parser.parse_known_args()
+    asked.settings = settings
+    {"policy": policy, "model": model}[asked.question](asked)
