@@ -73,6 +73,7 @@ def test_where_nothing_can_be_written_nothing_is_measured(file: str, tmp_path: P
         main(["benchmark", "--json", str(tmp_path / file)])
 
 
+@pytest.mark.timeout(300)  # whole processes, a minute on a slow machine and three beside other work
 def test_everything_is_measured_and_written(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
