@@ -36,5 +36,7 @@ class Critics(eqx.Module):
         self, observation: Float[Array, "*batch observation"], action: Float[Array, "*batch action"]
     ) -> Float[Array, "critic *batch"]:
         pair = jnp.concatenate([observation, action], axis=-1)
-        values: Array = eqx.filter_vmap(lambda mlp, x: mlp(x), in_axes=(0, None))(self.mlps, pair)
-        return values[..., 0]
+        # As one axis of rows, over which XLA sums weights' gradients without first transposing what it sums.
+        rows = pair.reshape(-1, pair.shape[-1])
+        values: Array = eqx.filter_vmap(lambda mlp, x: mlp(x), in_axes=(0, None))(self.mlps, rows)
+        return values.reshape(-1, *pair.shape[:-1])

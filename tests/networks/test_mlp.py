@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mbdpg.networks.mlp import MLP, LayerNorm, Linear, elu
+from mbdpg.networks.mlp import MLP, Linear, NormalizedELU, elu
 
 
 def shaken(module, rng: np.random.Generator):
@@ -86,11 +86,33 @@ def test_output_scale_zero_starts_as_the_constant_zero(key: jax.Array) -> None:
     assert not MLP(3, (8,), 2, output_scale=0.0, key=key)(jnp.ones((4, 3))).any()
 
 
-def test_layer_norm_of_equal_features_is_its_offset_with_a_finite_gradient() -> None:
-    norm = shaken(LayerNorm(4), np.random.default_rng(2))
+def test_equal_features_give_the_elu_of_the_offset_with_a_finite_gradient() -> None:
+    norm = shaken(NormalizedELU(4), np.random.default_rng(2))
     same = jnp.full((2, 4), 7.0)
-    np.testing.assert_allclose(norm(same), np.broadcast_to(norm.offset, (2, 4)))
+    np.testing.assert_allclose(norm(same), np.broadcast_to(elu(norm.offset), (2, 4)), rtol=1e-6)
     assert jnp.isfinite(jax.grad(lambda x: jnp.sum(jnp.square(norm(x))))(same)).all()
+
+
+@pytest.mark.parametrize("lead", [(), (5,), (2, 5)])
+def test_normalization_and_elu_have_the_derivative_that_differentiating_them_gives(lead: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(4)
+    norm = shaken(NormalizedELU(6), rng)
+    x = jnp.asarray(rng.normal(1.0, 2.0, (*lead, 6)), jnp.float32)
+    weights = jnp.asarray(rng.normal(size=x.shape), jnp.float32)
+
+    def plain(norm: NormalizedELU, x: jax.Array) -> jax.Array:
+        ones = (1,) * (x.ndim - 1) + (6,)
+        normalized = jax.nn.standardize(x, axis=-1, epsilon=1e-5)
+        return jnp.sum(weights * jax.nn.elu(normalized * norm.scale.reshape(ones) + norm.offset.reshape(ones)))
+
+    def ours(norm: NormalizedELU, x: jax.Array) -> jax.Array:
+        return jnp.sum(weights * norm(x))
+
+    expected = jax.grad(plain, argnums=(0, 1))(norm, x)
+    for mine, other in zip(
+        jax.tree.leaves(jax.grad(ours, argnums=(0, 1))(norm, x)), jax.tree.leaves(expected), strict=True
+    ):
+        np.testing.assert_allclose(mine, other, rtol=1e-4, atol=1e-5)
 
 
 def test_the_gradient_reaches_every_parameter(key: jax.Array) -> None:

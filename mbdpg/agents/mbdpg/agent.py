@@ -121,13 +121,16 @@ class MBDPG:
         imagined = jax.lax.stop_gradient(imagined)
         targets = self._targets(state, window, start, imagined, key=target_key)
 
+        # One call for real and imagined steps: each call packs all weights anew.
+        observations = jnp.concatenate([window.observation[:, -1][None], imagined.observations[:-1]])
+        actions = jnp.concatenate([window.action[:, -1][None], imagined.actions[:-1]])
+        weights = imagined.survival()[:-1] * start.weight[None]
+
         def loss(critics: Critics) -> tuple[Array, Array]:
-            real = critics(window.observation[:, -1], window.action[:, -1])
+            values = critics(observations, actions)
+            real, along = values[:, 0], values[:, 1:]
             total = objectives.critic_loss(real, targets[0], jnp.ones_like(targets[0]))
-            if c.imagined_weight > 0.0:
-                along = critics(imagined.observations[:-1], imagined.actions[:-1])
-                weights = imagined.survival()[:-1] * start.weight[None]
-                total += c.imagined_weight * objectives.critic_loss(along, targets[1], weights)
+            total += c.imagined_weight * objectives.critic_loss(along, targets[1], weights)
             return total, real
 
         (critic_loss, real), critic_gradient = jax.value_and_grad(loss, has_aux=True)(state.critics)
