@@ -31,8 +31,8 @@ from mbdpg.training.replay import Replay
 
 TASK = "HalfCheetah-v5"
 SPEC = EnvSpec(TASK, observation_size=17, action_size=6, episode_limit=1000, reference_return=4800.0)
-PAPER_SIZES = mbdpg.Config(horizon=20, batch_size=128, fit_batch_size=128, fit_length=10, gaussians=5)
-"""Section 5.1's batch, horizon, training length and networks, in the default method with the full gradient."""
+PAPER_SIZES = mbdpg.Config(horizon=20, batch_size=128, fit_batch_size=128, fit_length=10, burn_in=5, gaussians=5)
+"""Section 5.1's batch, horizon, training length and networks, with the full gradient, after five real steps."""
 
 ROWS = 2000
 """Made-up environment steps that updates learn from."""

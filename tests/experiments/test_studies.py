@@ -8,7 +8,7 @@ import pytest
 
 from mbdpg.agents import mbdpg
 from mbdpg.experiments.presets import agent_config
-from mbdpg.experiments.studies import SCALES, ScaleName, StudyName, study
+from mbdpg.experiments.studies import FAR, SCALES, ScaleName, StudyName, study
 
 NAMES, SCALE_NAMES = get_args(StudyName), get_args(ScaleName)
 
@@ -57,7 +57,7 @@ def test_they_are_the_papers() -> None:
 def test_an_ablation_changes_one_thing() -> None:
     dynamics, demonstrations, values, model = study("figure-9", "paper").panels
     whole, plain = (model.agent for model in dynamics.models)
-    assert whole == mbdpg.Config() and (plain.gaussians, plain.memory) == (1, 0)
+    assert whole == mbdpg.Config(**FAR) and (plain.gaussians, plain.memory) == (1, 0)
     whole, other = demonstrations.cells
     assert whole.config == other.config and (whole.demonstrated, other.demonstrated) == (False, True)
     for panel, field, value in ((values, "terminal_value", False), (model, "horizon", 0)):

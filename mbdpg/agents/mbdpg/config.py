@@ -72,13 +72,13 @@ class Config:
     """Every episode's spread is drawn uniformly from within this share of its mean, from none to twice as much at 1."""
     random_steps: int = 4000
     """Environment steps with uniformly random actions before learning starts."""
-    fit_length: int = 10
+    fit_length: int = 5
     """Open-loop steps L that the dynamics are trained over."""
-    burn_in: int = 5
+    burn_in: int = 1
     """Real steps that fill the memory before the one that open-loop training or imagination starts from."""
     fit_batch_size: int = 64
     """Windows per dynamics update."""
-    fits_per_step: float = 0.2
+    fits_per_step: float = 0.5
     """Dynamics updates per environment step."""
     pretraining_fits: int = 1000
     """Dynamics updates on the random steps before the first actor and critic update."""
@@ -88,7 +88,7 @@ class Config:
     """Negative log-likelihood of the mixture itself, or Eq. 11 as printed."""
     mean_weight: float = 1.0
     """Weight of the square error of the mixture's mean in the dynamics loss."""
-    dynamics_learning_rate: float = 1e-3
+    dynamics_learning_rate: float = 3e-3
     """Adam's step size for the dynamics."""
     dynamics_clip: float = 10.0
     """Global norm to which the dynamics' gradient is clipped."""
