@@ -41,7 +41,7 @@ def given_to(peer: Path, learner: Learner) -> Any:
     phase = phase_of(agent, "improving")
     batches = made_up_batches(phase, 1)
     state, batch = (jax.tree.map(lambda x: x[0], tree) for tree in (learner.state, batches))
-    window = agent.normalized(state, batch)
+    window = state.window(batch)
     arrays = {
         name: value
         for name, value in learner.snapshot(0).items()

@@ -57,7 +57,7 @@ def policy(options: argparse.Namespace) -> None:
     @jax.jit
     def dream(states: Any, key: Any) -> Any:
         state = jax.tree.map(lambda leaf: leaf[0], states)
-        start = agent._start(state, agent.normalized(state, starts), key=key)
+        start = agent._start(state, state.window(starts), key=key)
         model, actor, key = state.average_dynamics, state.average_actor, key if drawn else None
         imagined = imagine(model, state.scales, actor, start.observation, start.memory, horizon=DREAM, key=key)
         return jnp.mean(imagined.rewards[DREAM // 2 :]) * state.return_scale
@@ -93,7 +93,7 @@ def model(options: argparse.Namespace) -> None:
     @jax.jit
     def measure(states: Any) -> Any:
         state = jax.tree.map(lambda leaf: leaf[0], states)
-        window = agent.normalized(state, tested)
+        window = state.window(tested)
         return open_loop_error(state.average_dynamics, state.scales, window, burn_in=burn_in)
 
     began = time.perf_counter()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -18,6 +17,7 @@ import pytest
 
 import mbdpg
 from mbdpg.cli import main
+from mbdpg.cli.places import Places
 from mbdpg.cli.verbs import VERBS
 from mbdpg.experiments import expert
 from mbdpg.experiments.launch import Local
@@ -387,7 +387,7 @@ def test_a_study_that_is_stopped_says_how_to_go_on(say: Any, monkeypatch: pytest
     monkeypatch.setattr("mbdpg.cli.reproduce.reproduce_study", stopped)
     said = say("reproduce", "figure-8", "--scale", "smoke", "--seeds", "3")
     assert said == Said(143, "", "mbdpg: saved; go on with: mbdpg reproduce figure-8 --scale smoke --seeds 3\n")
-    assert given == ["figure-8", "smoke", Path.cwd() / "studies" / "smoke", Local(os.cpu_count() or 1)]
+    assert given == ["figure-8", "smoke", Path.cwd() / "studies" / "smoke", Local(Places().workers)]
 
 
 def test_an_expert_of_another_environment_is_refused(say: Any, trained: Path) -> None:

@@ -33,21 +33,30 @@ def expanded_values(
     continues: Float[Array, "time batch"],
     values: Float[Array, "state batch"],
     discount: float,
-    trace: float,
+    trace: float | Float[Array, "time batch"],
 ) -> Float[Array, "time batch"]:
     """The value expansion of Eq. 16: for every t, sum_{h=t}^{H-1} gamma^{h-t} r_{h+1} + gamma^{H-t} Q(s_H, a_H).
 
     As printed the powers are gamma^h, which would teach Q(s_t) the value gamma^t Q for t > 0. Beyond the paper, each
     step counts by the probability of still being alive, and `trace` (lambda) < 1 averages over shorter expansions
-    geometrically, as in TD(lambda): 1 is Eq. 16, 0 the one-step target.
+    geometrically, as in TD(lambda): 1 is Eq. 16, 0 the one-step target. Of real steps, a trace of 0 where none follows
+    makes them returns to the last one.
     """
 
-    def step(after: Array, inputs: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-        reward, alive, next_value = inputs
-        target = reward + discount * alive * ((1.0 - trace) * next_value + trace * after)
+    def step(after: Array, inputs: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:
+        reward, alive, next_value, share = inputs
+        target = reward + discount * alive * ((1.0 - share) * next_value + share * after)
         return target, target
 
-    return jax.lax.scan(step, values[-1], (rewards, continues, values[1:]), reverse=True)[1]
+    steps = (rewards, continues, values[1:], jnp.full(rewards.shape, trace, rewards.dtype))
+    return jax.lax.scan(step, values[-1], steps, reverse=True)[1]
+
+
+def likeness(
+    actions: Float[Array, "*batch action"], others: Float[Array, "*batch action"], tolerance: float
+) -> Float[Array, "*batch"]:
+    """1 where actions are the same, e^(-1/2) where they are `tolerance` apart in root mean square."""
+    return jnp.exp(-0.5 * jnp.mean(jnp.square((actions - others) / tolerance), axis=-1))
 
 
 def critic_loss(

@@ -165,7 +165,7 @@ def errors(agent: MBDPG, model: Any, state: State, steps: Recorded) -> np.ndarra
 
     @jax.jit
     def measure(model: Any, state: State, windows: Batch) -> Array:
-        return open_loop_error(model, state.scales, agent.normalized(state, windows), burn_in=burn_in)
+        return open_loop_error(model, state.scales, state.window(windows), burn_in=burn_in)
 
     return np.asarray(measure(model, state, windows))
 

@@ -34,6 +34,7 @@ PAPER: dict[str, dict[str, Any]] = {
         "random_steps": 4000,
         "fit_length": 10,
         "burn_in": 190,
+        "groundings_per_step": 0.0,
         "fits_per_step": 0.2,
         "fit_batch_size": 128,
         "likelihood": "eq11",

@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from mbdpg.agents.mbdpg import MBDPG, Config, State
@@ -86,7 +87,7 @@ def batch(length: int, size: int = BATCH, seed: int = 0) -> Batch:
     return Batch(draw(O), np.tanh(draw(A)), draw(), draw(O), 0 * ones, ones)
 
 
-BATCHES = {"fit": batch(BURN_IN + LENGTH), "clone": batch(1), "improve": batch(BURN_IN + 1)}
+BATCHES = {"fit": batch(BURN_IN + LENGTH), "clone": batch(1), "improve": batch(BURN_IN + 1), "ground": batch(4)}
 TARGETS = {"target_actor", "target_critics"}
 NETWORKS_OF_A_STATE = ("dynamics", "average_dynamics", "actor", "average_actor", "critics", *sorted(TARGETS))
 MOVES = {
@@ -94,6 +95,7 @@ MOVES = {
     "improve": {"actor", "average_actor", "critics", "actor_optimizer", "critic_optimizer", "updates", *TARGETS},
 }
 MOVES["clone"] = MOVES["improve"]
+MOVES["ground"] = {"critics", "critic_optimizer", "updates", *TARGETS}
 
 
 def finite(tree: Any) -> bool:
@@ -108,7 +110,7 @@ def edited(original: Batch, **changes: tuple[Any, float]) -> Batch:
     return copy
 
 
-@pytest.mark.parametrize("name", ["fit", "clone", "improve"])
+@pytest.mark.parametrize("name", ["fit", "clone", "improve", "ground"])
 def test_an_update_moves_its_own_networks_and_nothing_else(name: str, differences: Callable[..., set[str]]) -> None:
     after, metrics = update(name)(state(), BATCHES[name])
     assert differences(state(), after) == MOVES[name]
@@ -168,13 +170,37 @@ def test_averages_reach_back_over_a_share_of_the_updates(share: float, updates: 
 
 @pytest.mark.parametrize("name", ["fit", "clone", "improve"])
 def test_each_update_moves_the_average_of_what_it_learns(name: str) -> None:
-    before = eqx.tree_at(lambda x: (x.fits, x.updates), state(), (jnp.int32(1000),) * 2)
+    counted = optax.tree.set(state().actor_optimizer, count=jnp.int32(1000))
+    before = eqx.tree_at(lambda x: (x.fits, x.actor_optimizer), state(), (jnp.int32(1000), counted))
     after, _ = update(name)(before, BATCHES[name])
     rate = 1 / (1 + 1000 * agent().config.average_share)
     network = "dynamics" if name == "fit" else "actor"
     trees = (getattr(before, f"average_{network}"), getattr(after, f"average_{network}"), getattr(after, network))
     for old, new, followed in zip(*map(jax.tree.leaves, trees), strict=True):
         np.testing.assert_allclose(new, (1 - rate) * old + rate * followed, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("tolerance", [1e-3, 0.5, 1e3])
+def test_real_returns_are_numpys_while_actions_are_alike_and_steps_follow(tolerance: float) -> None:
+    given = edited(BATCHES["ground"], terminated=((0, 2), 1.0), valid=((0, 3), 0.0))
+    given = edited(given, valid=((1, slice(2, None)), 0.0))  # cut off after two steps
+    settings = (("target_noise", 0.0), ("grounding_tolerance", tolerance))
+    one, s = agent(settings), state()
+    _, metrics = update("ground", settings)(s, given)
+    observation, after = (s.normalizer(jnp.asarray(x)) for x in (given.observation, given.next_observation))
+    values = np.asarray(one._target_value(s, after, key=jax.random.key(0)))
+    found = np.asarray(s.critics(observation, jnp.asarray(given.action)))
+    away = np.sqrt(np.mean((given.action - np.asarray(s.actor(observation))) ** 2, axis=-1))
+    rewards, total = given.reward / np.asarray(s.return_scale), 0.0
+    for i in range(BATCH):
+        last = int(given.valid[i].sum()) - 1
+        target = 0.0 if given.terminated[i, last] else values[i, last]
+        for t in range(last, -1, -1):
+            share = 1.0 if t == last else np.exp(-0.5 * (away[i, t + 1] / tolerance) ** 2)
+            alive = 1.0 - given.terminated[i, t]
+            target = rewards[i, t] + one.config.discount * alive * ((1 - share) * values[i, t] + share * target)
+            total += np.sum((found[:, i, t] - target) ** 2)
+    assert float(metrics["critic/grounding_loss"]) == pytest.approx(total / given.valid.sum(), rel=1e-4)
 
 
 def test_the_averages_are_evaluated_and_imagine_and_the_newest_learn(differences: Callable[..., set[str]]) -> None:
@@ -210,7 +236,7 @@ def test_the_averages_are_evaluated_and_imagine_and_the_newest_learn(differences
 
 def test_without_a_horizon_nothing_depends_on_the_model(differences: Callable[..., set[str]]) -> None:
     settings = (("horizon", 0),)
-    assert [phase.name for phase in agent(settings).phases] == ["cloning", "improving"]
+    assert [phase.name for phase in agent(settings).phases] == ["cloning", "improving", "grounding"]
     elsewhere = eqx.tree_at(
         lambda x: x.average_dynamics, state(), jax.tree.map(lambda x: x + 1.0, state().average_dynamics)
     )
@@ -226,14 +252,14 @@ def test_without_a_horizon_nothing_depends_on_the_model(differences: Callable[..
 def test_without_a_horizon_the_critics_target_is_td3s() -> None:
     """Eq. 14, with the value of the target actor's smoothed action."""
     one, key = agent((("horizon", 0), ("target_noise", 0.0))), jax.random.key(0)
-    window = one.normalized(state(), jax.tree.map(jnp.asarray, edited(BATCHES["improve"], terminated=((0, -1), 1))))
+    window = state().window(jax.tree.map(jnp.asarray, edited(BATCHES["improve"], terminated=((0, -1), 1))))
     start = one._start(state(), window, key=key)
     imagined = one._actor_loss(state().actor, state(), start, key)[1][0]
     found, along = one._targets(state(), window, start, imagined, key=key)
     after = window.next_observation[:, -1]
     value = np.min(state().target_critics(after, state().target_actor(after)), axis=0)
     alive = 1.0 - np.asarray(window.terminated[:, -1])
-    expected = np.asarray(one._real_reward(state(), window)) + 0.99 * alive * value
+    expected = np.asarray(state().real_reward(window))[:, -1] + 0.99 * alive * value
     np.testing.assert_allclose(found, expected, rtol=1e-5)
     assert along.shape == (0, BATCH)
 
@@ -263,7 +289,7 @@ def test_the_real_step_is_the_first_of_the_expansion(trace: float) -> None:
     """TD(lambda) over the real step and then the imagined ones, by hand."""
     one = agent((("trace", trace), ("target_noise", 0.0)))
     data = jax.tree.map(jnp.asarray, edited(BATCHES["improve"], terminated=((0, -1), 1)))
-    window, key = one.normalized(state(), data), jax.random.key(0)
+    window, key = state().window(data), jax.random.key(0)
     start = one._start(state(), window, key=key)
     _, (imagined, _) = one._actor_loss(state().actor, state(), start, key)
     found = one._targets(state(), window, start, imagined, key=key)
@@ -273,7 +299,7 @@ def test_the_real_step_is_the_first_of_the_expansion(trace: float) -> None:
     for t in reversed(range(len(rewards))):
         after = rewards[t] + 0.99 * alive[t] * ((1 - trace) * value[t + 1] + trace * after)
         along.insert(0, after)
-    real = np.asarray(one._real_reward(state(), window))
+    real = np.asarray(state().real_reward(window))[:, -1]
     real = real + 0.99 * (1 - np.asarray(window.terminated[:, -1])) * ((1 - trace) * value[0] + trace * after)
     np.testing.assert_allclose(found[0], real, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(found[1], along, rtol=1e-4, atol=1e-5)
@@ -332,7 +358,7 @@ def test_a_time_limit_is_not_an_end(differences: Callable[..., set[str]]) -> Non
             replay.add(
                 observation, np.tanh(action), 1.0, after, last and kind == "terminated", last and kind == "truncated"
             )
-        windows = replay.windows(np.full(BATCH, BURN_IN), agent().phases[-1].sampling)
+        windows = replay.windows(np.full(BATCH, BURN_IN), agent().phases[2].sampling)
         assert windows.valid.all()
         other = edited(windows, next_observation=((slice(None), -1), 0.3))
         outcomes = [update("improve")(state(), windows)[0] for windows in (windows, other)]
@@ -361,7 +387,7 @@ def test_imagination_goes_on_from_the_buffer_up_to_its_depth() -> None:
 
 def test_a_share_of_one_imagines_from_real_states_only_while_the_buffer_is_empty() -> None:
     one = agent((("imagination_ratio", 1.0),))
-    window = one.normalized(state(), jax.tree.map(jnp.asarray, BATCHES["improve"]))
+    window = state().window(jax.tree.map(jnp.asarray, BATCHES["improve"]))
     start = jax.jit(lambda s: one._start(s, window, key=jax.random.key(0)))
     np.testing.assert_array_equal(start(state()).observation, window.next_observation[:, -1])
     rows = state().imagined.rows._replace(weight=jnp.full(32, 0.5), depth=jnp.full(32, 2.0))
@@ -372,9 +398,9 @@ def test_a_share_of_one_imagines_from_real_states_only_while_the_buffer_is_empty
 
 def test_rewards_reach_the_critics_in_units_of_value_and_the_model_in_its_own() -> None:
     mixed = jax.tree.map(jnp.asarray, edited(BATCHES["improve"], terminated=((0, -1), 1)))
-    window = agent().normalized(state(), mixed)
+    window = state().window(mixed)
     reward = np.asarray(mixed.reward)
-    np.testing.assert_allclose(agent()._real_reward(state(), window), reward[:, -1] / 2.0, rtol=1e-5)
+    np.testing.assert_allclose(state().real_reward(window), reward / 2.0, rtol=1e-5)
     np.testing.assert_allclose(window.reward[1:], reward[1:] / 0.8, rtol=1e-5)
     np.testing.assert_allclose(window.terminal_reward[0, -1], reward[0, -1] / 5.0, rtol=1e-5)
     assert window.reward[0, -1] == 0 and not window.terminal_reward[1:].any()

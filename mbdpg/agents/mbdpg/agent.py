@@ -1,4 +1,4 @@
-"""The agent: `fit` learns the dynamics, `clone` from demonstrations, `improve` the critics and the actor."""
+"""The agent: `fit` learns the dynamics, `clone` from demonstrations, `improve` critics and actor, `ground` critics."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from mbdpg.networks.policy import Policy
 
 
 class MBDPG:
-    """Algorithm 1: `clone` is line 3, `fit` line 7 and `improve` lines 11 to 14."""
+    """Algorithm 1: `clone` is line 3, `fit` line 7 and `improve` lines 11 to 14; `ground` is ours."""
 
     def __init__(self, config: Config, env: EnvSpec):
         self.config = config
@@ -35,11 +35,13 @@ class MBDPG:
         fitted = Sampling(c.fit_batch_size, c.burn_in, c.fit_length)
         cloned = Sampling(c.batch_size, burn_in=0, length=1, demonstrated=True)
         improved = Sampling(c.batch_size, c.burn_in, length=1)
+        grounded = Sampling(c.grounding_batch_size, burn_in=0, length=c.grounding_length)
         fitting = Phase("fitting", c.fits_per_step, c.random_steps, fitted, c.pretraining_fits, self.fit)
         self.phases = (
             Phase("cloning", 0.0, c.random_steps, cloned, c.cloning_updates, self.clone),
             *([fitting] if c.horizon > 0 else []),
             Phase("improving", c.updates_per_step, c.random_steps, improved, 0, self.improve),
+            Phase("grounding", c.groundings_per_step, c.random_steps, grounded, 0, self.ground),
         )
 
     def init(self, *, key: PRNGKeyArray) -> State:
@@ -80,7 +82,7 @@ class MBDPG:
         gradient, metrics = jax.grad(dynamics_loss, has_aux=True)(
             state.dynamics,
             state.scales,
-            self.normalized(state, batch),
+            state.window(batch),
             burn_in=c.burn_in,
             likelihood=c.likelihood,
             mean_weight=c.mean_weight,
@@ -101,8 +103,7 @@ class MBDPG:
 
     def clone(self, state: State, batch: Batch, *, key: PRNGKeyArray) -> tuple[State, Metrics]:
         """Learn critics (Eq. 14) and actor (Eq. 15) from a batch of demonstrated transitions."""
-        window = self.normalized(state, batch)
-        state = self._evaluate(state, window, key=key)
+        window, (state, _) = state.window(batch), self.ground(state, batch, key=key)
         observation, action = window.observation[:, -1], window.action[:, -1]
 
         def loss(actor: Policy) -> Array:
@@ -114,7 +115,7 @@ class MBDPG:
     def improve(self, state: State, batch: Batch, *, key: PRNGKeyArray) -> tuple[State, Metrics]:
         """One update of the critics (Eq. 16, 17) and of the actor (Eq. 18) on trajectories imagined after a batch."""
         c = self.config
-        window = self.normalized(state, batch)
+        window = state.window(batch)
         start_key, target_key, model_key = jax.random.split(key, 3)
         start = self._start(state, window, key=start_key)
         gradient, (imagined, metrics) = jax.grad(self._actor_loss, has_aux=True)(state.actor, state, start, model_key)
@@ -147,43 +148,31 @@ class MBDPG:
             "actor/beta": state.beta,
         }
 
-    def normalized(self, state: State, batch: Batch) -> Window:
-        """A batch in the units that networks see."""
-        terminated = batch.terminated
-        value = batch.reward / state.return_scale
-        return Window(
-            observation=state.normalizer(batch.observation),
-            action=batch.action,
-            next_observation=state.normalizer(batch.next_observation),
-            reward=value * (1.0 - terminated) / state.scales.reward,
-            terminal_reward=value * terminated / state.scales.terminal_reward,
-            terminated=terminated,
-            valid=batch.valid,
-        )
+    def ground(self, state: State, batch: Batch, *, key: PRNGKeyArray) -> tuple[State, Metrics]:
+        """One update of the critics on real steps alone (Eq. 14 with targets and clipping), by returns over several.
 
-    def _real_reward(self, state: State, window: Window) -> Array:
-        """Rewards of the windows' last steps in units of value."""
-        scales = state.scales
-        return window.reward[:, -1] * scales.reward + window.terminal_reward[:, -1] * scales.terminal_reward
+        A return follows what was done while it resembles what the policy does, as in Retrace (Munos et al. 2016).
+        """
+        steps = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), state.window(batch))
+        values = self._target_value(state, jnp.concatenate([steps.observation[:1], steps.next_observation]), key=key)
+        chosen = state.actor(steps.observation)
+        alike = steps.valid * objectives.likeness(steps.action, chosen, self.config.grounding_tolerance)
+        trace = jnp.concatenate([alike[1:], jnp.zeros_like(alike[:1])])  # whether to follow the next step
+        rewards, continues = state.real_reward(steps), 1.0 - steps.terminated
+        targets = objectives.expanded_values(rewards, continues, values, self.config.discount, trace)
+
+        def loss(critics: Critics) -> Array:
+            return objectives.critic_loss(critics(steps.observation, steps.action), targets, steps.valid)
+
+        value, gradient = jax.value_and_grad(loss)(state.critics)
+        metrics = {"critic/grounding_loss": value, "critic/grounding_trace": jnp.mean(trace[:-1])}
+        return self._step_critics(state, gradient), metrics
 
     def _target_value(self, state: State, observation: Array, *, key: PRNGKeyArray) -> Array:
         """Clipped value of the target policy's action, smoothed as in TD3."""
         action = state.target_actor(observation)
         noise = jnp.clip(self.config.target_noise * jax.random.normal(key, action.shape), -0.5, 0.5)
         return objectives.clipped_value(state.target_critics(observation, jnp.clip(action + noise, -1.0, 1.0)))
-
-    def _evaluate(self, state: State, window: Window, *, key: PRNGKeyArray) -> State:
-        """One critic update on real transitions alone (Eq. 14 with targets and clipping)."""
-        next_value = self._target_value(state, window.next_observation[:, -1], key=key)
-        target = objectives.temporal_difference_target(
-            self._real_reward(state, window), window.terminated[:, -1], next_value, self.config.discount
-        )
-
-        def loss(critics: Critics) -> Array:
-            values = critics(window.observation[:, -1], window.action[:, -1])
-            return objectives.critic_loss(values, target, jnp.ones_like(target))
-
-        return self._step_critics(state, jax.grad(loss)(state.critics))
 
     def _step_critics(self, state: State, gradient: Critics) -> State:
         """Step the critics, then let the targets follow every C-th time."""
@@ -202,7 +191,7 @@ class MBDPG:
     def _step_actor(self, state: State, gradient: Policy) -> State:
         updates, optimizer_state = self._optimizers.actor.update(gradient, state.actor_optimizer)
         actor = optax.apply_updates(state.actor, updates)
-        average = self._average(state.average_actor, actor, state.updates - 1)  # the critics' step has counted this one
+        average = self._average(state.average_actor, actor, optax.tree.get(state.actor_optimizer, "count"))
         return eqx.tree_at(
             lambda x: (x.actor, x.average_actor, x.actor_optimizer), state, (actor, average, optimizer_state)
         )
@@ -274,10 +263,8 @@ class MBDPG:
         if c.imagination_ratio > 0.0:  # where imagination went on from elsewhere, the transition has one step
             one_step = self._target_value(state, window.next_observation[:, -1], key=real_key)
             after = jnp.where(start.depth == 0.0, after, one_step)
-        real = objectives.temporal_difference_target(
-            self._real_reward(state, window), window.terminated[:, -1], after, c.discount
-        )
-        return real, expanded
+        reward = state.real_reward(window)[:, -1]
+        return objectives.temporal_difference_target(reward, window.terminated[:, -1], after, c.discount), expanded
 
     def _store(self, ring: Ring, start: Start, imagined: Trajectory) -> Ring:
         """Keep where imagination ended, with weight 0 (nothing starts there) if it went too deep."""
@@ -293,7 +280,7 @@ class MBDPG:
 
     def diagnose(self, state: State, batch: Batch, realized_return: Array) -> Metrics:
         """Open-loop error, Q and survival against what happened, gradient norm per imagined depth."""
-        window = self.normalized(state, batch)
+        window = state.window(batch)
         metrics = instruments.measure(self.config, state, window, realized_return)
         known = self.config.horizon > 0  # else the dynamics are never trained
         return {name: value for name, value in metrics.items() if known or not name.startswith("dynamics/")}

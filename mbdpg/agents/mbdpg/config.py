@@ -70,6 +70,14 @@ class Config:
     """Noise of the behavior policy has power 1/f^color: 0 is white, 1 pink, correlated over many steps."""
     exploration_scatter: float = 1.0
     """Every episode's spread is drawn uniformly from within this share of its mean, from none to twice as much at 1."""
+    groundings_per_step: float = 1.0
+    """Updates of the critics on real steps alone per environment step."""
+    grounding_length: int = 8
+    """Consecutive real steps over which each takes returns."""
+    grounding_batch_size: int = 32
+    """Windows of so many steps in each."""
+    grounding_tolerance: float = 0.6
+    """A return goes on by e^(-d^2 / 2) past an action that is d times this, in root mean square, off the policy's."""
     random_steps: int = 4000
     """Environment steps with uniformly random actions before learning starts."""
     fit_length: int = 5
@@ -105,6 +113,7 @@ class Config:
             positive=(
                 *("batch_size", "updates_per_step", "actor_learning_rate", "critic_learning_rate"),
                 *("actor_clip", "critic_clip", "target_update_every", "fit_length", "fit_batch_size", "fits_per_step"),
+                *("grounding_length", "grounding_batch_size", "grounding_tolerance"),
                 *("dynamics_learning_rate", "dynamics_clip", "gaussians", "width"),
             ),
             at_most={

@@ -11,9 +11,10 @@ import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from mbdpg.agents.mbdpg.config import Config
+from mbdpg.dynamics.fitting import Window
 from mbdpg.dynamics.imagination import Ring, Start
 from mbdpg.dynamics.mixture import MixtureDynamics, Scales
-from mbdpg.interfaces import EnvSpec
+from mbdpg.interfaces import Batch, EnvSpec
 from mbdpg.networks.critic import Critics
 from mbdpg.networks.normalizer import Normalizer, identity
 from mbdpg.networks.policy import Policy
@@ -46,7 +47,25 @@ class State(eqx.Module):
     fits: Int[Array, ""]
     """Updates of the dynamics so far."""
     updates: Int[Array, ""]
-    """Updates of critics and actor so far."""
+    """Updates of the critics so far."""
+
+    def window(self, batch: Batch) -> Window:
+        """A batch in the units that networks see."""
+        terminated = batch.terminated
+        value = batch.reward / self.return_scale
+        return Window(
+            observation=self.normalizer(batch.observation),
+            action=batch.action,
+            next_observation=self.normalizer(batch.next_observation),
+            reward=value * (1.0 - terminated) / self.scales.reward,
+            terminal_reward=value * terminated / self.scales.terminal_reward,
+            terminated=terminated,
+            valid=batch.valid,
+        )
+
+    def real_reward(self, window: Window) -> Float[Array, "*batch"]:
+        """In units of value."""
+        return window.reward * self.scales.reward + window.terminal_reward * self.scales.terminal_reward
 
 
 class Optimizers(NamedTuple):
