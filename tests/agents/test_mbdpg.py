@@ -191,16 +191,23 @@ def test_real_returns_are_numpys_while_actions_are_alike_and_steps_follow(tolera
     values = np.asarray(one._target_value(s, after, key=jax.random.key(0)))
     found = np.asarray(s.critics(observation, jnp.asarray(given.action)))
     away = np.sqrt(np.mean((given.action - np.asarray(s.actor(observation))) ** 2, axis=-1))
-    rewards, total = given.reward / np.asarray(s.return_scale), 0.0
+    rewards, total, shares = given.reward / np.asarray(s.return_scale), 0.0, []
     for i in range(BATCH):
         last = int(given.valid[i].sum()) - 1
         target = 0.0 if given.terminated[i, last] else values[i, last]
         for t in range(last, -1, -1):
             share = 1.0 if t == last else np.exp(-0.5 * (away[i, t + 1] / tolerance) ** 2)
+            shares += [] if t == last else [share]
             alive = 1.0 - given.terminated[i, t]
             target = rewards[i, t] + one.config.discount * alive * ((1 - share) * values[i, t] + share * target)
             total += np.sum((found[:, i, t] - target) ** 2)
     assert float(metrics["critic/grounding_loss"]) == pytest.approx(total / given.valid.sum(), rel=1e-4)
+    assert float(metrics["critic/grounding_trace"]) == pytest.approx(np.mean(shares), rel=1e-4)
+
+
+def test_the_share_followed_is_a_number_where_returns_have_one_step() -> None:
+    _, metrics = update("ground", ())(state(), batch(1))
+    assert float(metrics["critic/grounding_trace"]) == 0.0
 
 
 def test_the_averages_are_evaluated_and_imagine_and_the_newest_learn(differences: Callable[..., set[str]]) -> None:

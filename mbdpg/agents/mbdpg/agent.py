@@ -103,7 +103,8 @@ class MBDPG:
 
     def clone(self, state: State, batch: Batch, *, key: PRNGKeyArray) -> tuple[State, Metrics]:
         """Learn critics (Eq. 14) and actor (Eq. 15) from a batch of demonstrated transitions."""
-        window, (state, _) = state.window(batch), self.ground(state, batch, key=key)
+        window = state.window(batch)
+        state, _ = self.ground(state, batch, key=key)
         observation, action = window.observation[:, -1], window.action[:, -1]
 
         def loss(actor: Policy) -> Array:
@@ -165,7 +166,8 @@ class MBDPG:
             return objectives.critic_loss(critics(steps.observation, steps.action), targets, steps.valid)
 
         value, gradient = jax.value_and_grad(loss)(state.critics)
-        metrics = {"critic/grounding_loss": value, "critic/grounding_trace": jnp.mean(trace[:-1])}
+        following = jnp.maximum(jnp.sum(steps.valid[1:]), 1.0)  # steps that might be followed
+        metrics = {"critic/grounding_loss": value, "critic/grounding_trace": jnp.sum(trace) / following}
         return self._step_critics(state, gradient), metrics
 
     def _target_value(self, state: State, observation: Array, *, key: PRNGKeyArray) -> Array:
