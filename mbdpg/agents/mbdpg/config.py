@@ -76,7 +76,7 @@ class Config:
     """Consecutive real steps over which each takes returns."""
     grounding_batch_size: int = 32
     """Windows of so many steps in each."""
-    grounding_tolerance: float = 0.6
+    grounding_tolerance: float = 0.3
     """A return goes on by e^(-d^2 / 2) past an action that is d times this, in root mean square, off the policy's."""
     random_steps: int = 4000
     """Environment steps with uniformly random actions before learning starts."""
