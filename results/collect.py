@@ -1,15 +1,30 @@
-"""Copy the evaluations of run folders into one CSV and draw them: python results/collect.py NAME RUN..."""
+"""What the runs of a task came to, beside what others have published (published.csv).
+
+    python results/collect.py NAME RUN...     # run folders; without any, what NAME.csv has already
+
+NAME.csv has every evaluation of the runs, NAME.png every seed's curve and the mean over seeds. Printed are, per
+algorithm and budget: seeds, mean, standard deviation, and interquartile mean with its 95 % bootstrap interval.
+"""
 
 from __future__ import annotations
 
 import csv
 import sys
+from collections import defaultdict
 from pathlib import Path
 
-from mbdpg.reports.curves import draw_curves
+import matplotlib
+import numpy as np
+
+from mbdpg.reports.statistics import summarize
 from mbdpg.storage.metrics import read_metrics
 from mbdpg.storage.run_folder import RunFolder
 
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+HERE = Path(__file__).parent
+BUDGETS = (50_000, 100_000)
 COLUMNS = (
     "env_steps",
     "eval/return_mean",
@@ -30,11 +45,13 @@ COLUMNS = (
     "actor/grad_norm_k05",
 )
 
+Curves = dict[str, dict[int, float]]
+"""Return by environment step, by seed."""
+
 
 def collect(name: str, runs: list[Path]) -> None:
-    """Write NAME.csv and NAME.png beside this file, and print where the runs come from."""
-    here = Path(__file__).parent
-    with open(here / f"{name}.csv", "w", newline="") as file:
+    """Write NAME.csv, and print where the runs come from."""
+    with open(HERE / f"{name}.csv", "w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["env", "algorithm", "seed", *COLUMNS])
         for run in runs:
@@ -45,9 +62,59 @@ def collect(name: str, runs: list[Path]) -> None:
             for row in zip(*(rows.get(column, absent) for column in COLUMNS), strict=True):
                 shown = [f"{value:.6g}" if isinstance(value, float) else value for value in row]
                 writer.writerow([config["env"], config["algorithm"], config["seed"], *shown])
-    config = RunFolder.open(runs[0]).config
-    draw_curves({config["algorithm"]: runs}, here / f"{name}.png", title=config["env"])
+
+
+def read(name: str) -> tuple[str, dict[str, Curves]]:
+    """The task of NAME.csv, and its learning curves by algorithm."""
+    curves: dict[str, Curves] = defaultdict(lambda: defaultdict(dict))
+    with open(HERE / f"{name}.csv", newline="") as file:
+        for row in csv.DictReader(file):
+            curves[row["algorithm"]][row["seed"]][int(row["env_steps"])] = float(row["eval/return_mean"])
+            env = row["env"]
+    return env, curves
+
+
+def tell(curves: dict[str, Curves]) -> None:
+    """Print a table row per algorithm and budget that some of its seeds have reached."""
+    for algorithm, seeds in curves.items():
+        for budget in BUDGETS:
+            if scores := [curve[budget] for curve in seeds.values() if budget in curve]:
+                s = summarize(scores)
+                middle = f"{s.interquartile_mean:,.0f} [{s.low:,.0f}, {s.high:,.0f}]"
+                print(f"| {algorithm} | {budget:,} | {s.seeds} | {s.mean:,.0f} ± {s.std:,.0f} | {middle} |")
+
+
+def draw(name: str, env: str, curves: dict[str, Curves]) -> None:
+    """Write NAME.png: curves, and others' means at the budgets that they have published."""
+    figure, axes = plt.subplots(figsize=(8, 4.6), layout="constrained")
+    for number, (algorithm, seeds) in enumerate(curves.items()):
+        for curve in seeds.values():
+            axes.plot(list(curve), list(curve.values()), color=f"C{number}", alpha=0.35, linewidth=1)
+        shared = sorted(set.intersection(*map(set, seeds.values())))
+        mean = [np.mean([curve[step] for curve in seeds.values()]) for step in shared]
+        several = f"{len(seeds)} seed{'s' * (len(seeds) > 1)}"
+        axes.plot(shared, mean, color=f"C{number}", linewidth=2, label=f"{algorithm} ({several})")
+    others = defaultdict(list)
+    with open(HERE / "published.csv", newline="") as file:
+        for row in csv.DictReader(file):
+            if row["env"] == env.rpartition("-v")[0]:
+                others[row["method"], row["id"]].append((int(row["env_steps"]), float(row["mean"])))
+    for marker, ((method, version), points) in zip("osD^vP", others.items(), strict=False):
+        axes.plot(*zip(*points, strict=True), marker, color="0.35", fillstyle="none", label=f"{method} ({version})")
+    axes.set(xlabel="environment steps", ylabel="evaluation return", title=env)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small")
+    figure.savefig(HERE / f"{name}.png", dpi=110)
+
+
+def main(name: str, runs: list[Path]) -> None:
+    """Collect the runs, if there are any, then tell and draw what NAME.csv has."""
+    if runs:
+        collect(name, runs)
+    env, curves = read(name)
+    tell(curves)
+    draw(name, env, curves)
 
 
 if __name__ == "__main__":
-    collect(sys.argv[1], [Path(run) for run in sys.argv[2:]])
+    main(sys.argv[1], [Path(run) for run in sys.argv[2:]])
