@@ -112,15 +112,15 @@ def test_without_out_a_run_gets_a_folder_named_after_what_it_is(say: Any, toys: 
     assert folder.name.startswith("Pendulum-v1-td3-") and (folder / "seed-0" / "metrics.jsonl").exists()
 
 
-@pytest.mark.parametrize(("flags", "trace"), [((), 1.0), (("--trace", "0.7"), 0.7), (("--preset", "paper"), 1.0)])
+@pytest.mark.parametrize(("flags", "length"), [((), 32), (("--grounding-length", "7"), 7), (("--preset", "paper"), 8)])
 def test_a_task_s_own_settings_hold_wherever_its_id_stands_and_flags_go_over_them(
-    say: Any, toys: None, flags: Any, trace: float
+    say: Any, toys: None, flags: Any, length: int
 ) -> None:
     task = ("LunarLanderContinuous-v3",)
     for i, order in enumerate(((*task, *TINY[2:], *flags), (*TINY[2:], *flags, *task))):
         said = say("train", *order, "--out", f"run{i}")
         assert said.status == 0, said.err
-        assert RunFolder.open(Path(f"run{i}/seed-0")).config["agent"]["trace"] == trace
+        assert RunFolder.open(Path(f"run{i}/seed-0")).config["agent"]["grounding_length"] == length
 
 
 def test_evaluate_writes_a_video_without_a_display(mbdpg_command: Start, trained: Path, tmp_path: Path) -> None:
@@ -190,8 +190,8 @@ def test_train_s_help_shows_the_flags_of_the_algorithm_and_the_values_of_the_pre
     assert "--horizon" in standard and "--horizon" not in td3
     assert "--policy-delay" in td3 and "--policy-delay" not in standard
     assert "(default: 20)" in paper and "(default: 200000)" in paper
-    lander = say("train", "LunarLanderContinuous-v3", "--help").out.split("--trace")[1].split("--")[0]
-    assert "1.0" in lander and "1.0" not in standard.split("--trace")[1].split("--")[0]
+    lander = say("train", "LunarLanderContinuous-v3", "--help").out.split("--grounding-length")[1].split("--")[0]
+    assert "32" in lander and "32" not in standard.split("--grounding-length")[1].split("--")[0]
 
 
 # What a person can get wrong.

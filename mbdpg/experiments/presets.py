@@ -83,7 +83,13 @@ TASKS: dict[str, dict[str, dict[str, dict[str, Any]]]] = {
             "Ant": {"planning": "stochastic", "discount": 0.98, "exploration_std": 0.1},
             "HalfCheetah": {"planning": "stochastic", "discount": 0.98},  # 39, 41: late it exploits the mean's errors
             "Hopper": {"planning": "stochastic", "discount": 0.995},  # 50: with 0.99 it leaps and falls at step 170
-            "LunarLanderContinuous": {"trace": 1.0},  # 21: below 1 it hovers and never meets the ground
+            # 51, 53, 55: imagined rewards are too hopeful to land; with real returns over 8 steps it lands and forgets
+            "LunarLanderContinuous": {
+                "horizon": 0,
+                "grounding_length": 32,
+                "grounding_batch_size": 16,
+                "grounding_tolerance": 0.6,
+            },
         },
         "mbpo": MBPO_TASKS,
     },
