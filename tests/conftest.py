@@ -10,6 +10,7 @@ from types import ModuleType
 
 # Before JAX and NumPy are imported. Inherited by the programs that tests start; set from outside, a value stays.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ.setdefault("JAX_NUM_CPU_DEVICES", "2")  # several seeds are learned on both
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame opens no window
 os.environ.setdefault("MPLBACKEND", "agg")
 for library in ("OMP", "OPENBLAS", "MKL"):  # pytest-xdist already uses every core

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, PartitionSpec
 
 from mbdpg.dynamics.planning import Planner, PlanningPolicy
 from mbdpg.interfaces import Acting, Agent, Batch, Metrics, Phase, Statistics, UserError
@@ -23,8 +24,13 @@ EVALUATING, COLLECTING = 2**31, 2**31 + 1
 class Learner:
     """Holds the states of all seeds along a leading `seed` axis and runs k gradient steps per call."""
 
-    def __init__(self, agent: Agent, seeds: Sequence[int]):
+    def __init__(self, agent: Agent, seeds: Sequence[int], devices: Sequence[jax.Device] | None = None):
         """Initialize every seed's state from its own key.
+
+        Args:
+            agent: whose updates are taken.
+            seeds: one state each.
+            devices: share the seeds evenly, as many of them as can; by default all that this process has.
 
         Raises:
             MemoryError: the states alone are larger than this machine's memory, at which XLA would abort the process.
@@ -36,10 +42,11 @@ class Learner:
         self.agent = agent
         self._keys = jax.vmap(jax.random.key)(jnp.asarray(seeds, jnp.uint32))
         init_keys = jax.vmap(jax.random.fold_in, (0, None))(self._keys, 0)
-        self.state = jax.jit(over_seeds(lambda key: agent.init(key=key)))(init_keys)
-        self._prepare = jax.jit(over_seeds(agent.prepare), donate_argnums=0)
-        self._diagnose = jax.jit(over_seeds(agent.diagnose))
-        self._updates = {phase.name: _compile(phase) for phase in agent.phases}
+        mesh = seed_mesh(len(seeds), jax.local_devices() if devices is None else devices)
+        self.state = jax.jit(over_seeds(lambda key: agent.init(key=key), mesh))(init_keys)
+        self._prepare = jax.jit(over_seeds(agent.prepare, mesh), donate_argnums=0)
+        self._diagnose = jax.jit(over_seeds(agent.diagnose, mesh))
+        self._updates = {phase.name: _compile(phase, mesh) for phase in agent.phases}
 
     def prepare(self, statistics: Sequence[Statistics]) -> None:
         """Set each seed's scaling."""
@@ -52,7 +59,9 @@ class Learner:
             Means over the steps, one array of shape (seed,) per metric.
         """
         keys = jax.vmap(jax.random.fold_in, (0, None))(self._keys, 1 + self.agent.phases.index(phase))
-        self.state, metrics = self._updates[phase.name](self.state, _stack(batches), keys, jnp.uint32(done))
+        self.state, metrics = self._updates[phase.name](
+            self.state, _stack(batches), keys, np.full(len(keys), done, np.uint32)
+        )
         return {name: np.asarray(value) for name, value in metrics.items()}
 
     def diagnose(self, batches: Sequence[Batch], realized: Sequence[np.ndarray]) -> Metrics:
@@ -100,22 +109,35 @@ class Learner:
                         f"expected {leaf.dtype}{list(leaf.shape[1:])}"
                     )
                 arrays.append(found)
-            return jnp.asarray(np.stack(arrays))
+            return jax.device_put(np.stack(arrays), leaf.sharding)
 
         self.state = jax.tree_util.tree_map_with_path(put, self.state)
 
 
-def over_seeds(function: Any) -> Any:
-    """Map a one-seed function over leading seed axes.
+def seed_mesh(seeds: int, devices: Sequence[jax.Device]) -> Mesh:
+    """The seed axis over devices: over as many of them as get equally many seeds each."""
+    count = max(n for n in range(1, len(devices) + 1) if seeds % n == 0)
+    return Mesh(np.asarray(devices[:count]), ("seed",))
+
+
+def over_seeds(function: Any, mesh: Mesh) -> Any:
+    """Map a one-seed function over leading seed axes, each device its own seeds.
 
     On CPU one seed after the other, which computes for each exactly what it would alone; elsewhere all at once.
     """
-    if jax.default_backend() != "cpu":
-        return jax.vmap(function)
+    each = jax.vmap(function) if jax.default_backend() != "cpu" else _one_by_one(function)
+    if mesh.size == 1:
+        return each
+    # Seeds tell each other nothing, so that there is nothing to check of what varies over devices.
+    own = PartitionSpec("seed")  # type: ignore[no-untyped-call]
+    return jax.shard_map(each, mesh=mesh, in_specs=own, out_specs=own, check_vma=False)
+
+
+def _one_by_one(function: Any) -> Any:
     return lambda *args: jax.lax.map(lambda packed: function(*packed), args)
 
 
-def _compile(phase: Phase) -> Any:
+def _compile(phase: Phase, mesh: Mesh) -> Any:
     def many(state: Any, batches: Batch, key: Any, done: Any) -> tuple[Any, Metrics]:
         def one(carry: Any, inputs: tuple[Any, Batch]) -> tuple[Any, Metrics]:
             step, batch = inputs
@@ -125,10 +147,7 @@ def _compile(phase: Phase) -> Any:
         state, metrics = jax.lax.scan(one, state, (steps, batches))
         return state, jax.tree.map(lambda x: jnp.mean(x.astype(jnp.float32)), metrics)
 
-    def seeds(state: Any, batches: Batch, keys: Any, done: Any) -> tuple[Any, Metrics]:
-        return over_seeds(lambda s, b, k: many(s, b, k, done))(state, batches, keys)
-
-    return jax.jit(seeds, donate_argnums=0)
+    return jax.jit(over_seeds(many, mesh), donate_argnums=0)
 
 
 def _stack(items: Sequence[Any]) -> Any:

@@ -78,6 +78,13 @@ def same(left: dict[str, np.ndarray], right: dict[str, np.ndarray]) -> bool:
     )
 
 
+def same_but_for_rounding(left: dict[str, np.ndarray], right: dict[str, np.ndarray]) -> None:
+    """Sums are taken in another order where seeds are computed at once, or the program is one of several devices'."""
+    assert left.keys() == right.keys()
+    for key in left:
+        np.testing.assert_allclose(left[key], right[key], rtol=1e-4, atol=1e-5, err_msg=key)
+
+
 class Two(NamedTuple):
     """Two seeds learned in one process, and the second of them alone."""
 
@@ -91,12 +98,13 @@ MAKERS = {"td3": make_td3, "sac": make_sac, "pets": make_pets, "mbpo": make_mbpo
 # The slow ones compile as a user's program does; the quick compiler of the default tests rounds a last bit apart.
 SLOW = ("td3", "sac", "mbpo", "mbdpg")
 LEARNERS = ["toy", "pets", *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)]
+ONE, BOTH = jax.local_devices()[:1], jax.local_devices()[:2]
 
 
 @pytest.fixture(scope="module", params=LEARNERS)
 def two(request: pytest.FixtureRequest, toy: Any) -> Two:
     make = (MAKERS | {"toy": lambda: toy.ToyAgent(SPEC)})[request.param]
-    together, alone = Learner(make(), [4, 9]), Learner(make(), [9])
+    together, alone = Learner(make(), [4, 9], ONE), Learner(make(), [9])
     return Two(together, alone, learn(together, [4, 9]), learn(alone, [9]))
 
 
@@ -118,13 +126,33 @@ def test_all_seeds_under_one_vmap_learn_what_each_learns_alone_but_for_rounding(
 ) -> None:
     alone = Learner(MAKERS[name](), [9])
     learn(alone, [9])
-    monkeypatch.setattr(learner_module, "over_seeds", jax.vmap)  # as on a GPU
+    monkeypatch.setattr(learner_module, "over_seeds", lambda function, mesh: jax.vmap(function))  # as on a GPU
     together = Learner(MAKERS[name](), [4, 9])
     learn(together, [4, 9])
-    found, expected = together.snapshot(1), alone.snapshot(0)
-    assert not same(together.snapshot(0), found) and found.keys() == expected.keys()
-    for key in found:
-        np.testing.assert_allclose(found[key], expected[key], rtol=1e-4, atol=1e-5, err_msg=key)
+    assert not same(together.snapshot(0), together.snapshot(1))
+    same_but_for_rounding(together.snapshot(1), alone.snapshot(0))
+
+
+@pytest.mark.parametrize(
+    "name", ["td3", *(pytest.param(name, marks=pytest.mark.slow) for name in ("sac", "pets", "mbpo", "mbdpg"))]
+)
+def test_seeds_shared_by_two_devices_learn_what_each_learns_alone_but_for_rounding(name: str) -> None:
+    alone, shared = Learner(MAKERS[name](), [9]), Learner(MAKERS[name](), [4, 9], BOTH)
+    learn(alone, [9])
+    learn(shared, [4, 9])
+    assert all(len(leaf.sharding.device_set) == 2 for leaf in jax.tree.leaves(shared.state))
+    assert all(leaf.addressable_shards[0].data.shape[0] == 1 for leaf in jax.tree.leaves(shared.state))
+    assert not same(shared.snapshot(0), shared.snapshot(1))
+    same_but_for_rounding(shared.snapshot(1), alone.snapshot(0))
+    kept = [shared.snapshot(0), shared.snapshot(1)]
+    shared.restore(kept)
+    assert all(len(leaf.sharding.device_set) == 2 for leaf in jax.tree.leaves(shared.state))
+    assert same(shared.snapshot(0), kept[0]) and same(shared.snapshot(1), kept[1])
+
+
+@pytest.mark.parametrize(("seeds", "used"), [(1, 1), (2, 2), (3, 1), (4, 2)])
+def test_seeds_are_shared_by_as_many_devices_as_get_equally_many(seeds: int, used: int) -> None:
+    assert learner_module.seed_mesh(seeds, BOTH).size == used
 
 
 def test_every_array_of_a_state_is_in_its_snapshot_and_comes_back(two: Two) -> None:
@@ -220,8 +248,15 @@ def compilations() -> Iterator[list[str]]:
     jax.monitoring.unregister_event_duration_listener(note)
 
 
-def test_nothing_is_compiled_after_the_first_round(toy: Any, compilations: list[str]) -> None:
-    learner = Learner(toy.ToyAgent(SPEC), [4, 9])
+@pytest.mark.parametrize(
+    ("name", "devices"),
+    [("toy", ONE), ("toy", BOTH), *(pytest.param(name, ONE, marks=pytest.mark.slow) for name in MAKERS)],
+    ids=lambda value: value if isinstance(value, str) else f"{len(value)} devices",
+)
+def test_nothing_is_compiled_after_the_first_round(
+    name: str, devices: list[jax.Device], toy: Any, compilations: list[str]
+) -> None:
+    learner = Learner((MAKERS | {"toy": lambda: toy.ToyAgent(SPEC)})[name](), [4, 9], devices)
     learn(learner, [4, 9], range(1))
     diagnosed(learner, [4, 9])
     learner.behaviors()
@@ -233,6 +268,15 @@ def test_nothing_is_compiled_after_the_first_round(toy: Any, compilations: list[
     learner.behaviors()
     learner.snapshot(1)
     assert compilations == []
+
+
+@pytest.mark.parametrize("devices", [ONE, BOTH], ids=["one device", "two devices"])
+def test_an_update_writes_the_new_state_where_the_old_one_was(devices: list[jax.Device], toy: Any) -> None:
+    learner, phase = Learner(toy.ToyAgent(SPEC), [4, 9], devices), toy.ToyAgent(SPEC).phases[0]
+    before = jax.tree_util.tree_leaves_with_path(learner.state)
+    batches = [experience(seed).sample(2, phase.sampling, np.random.default_rng(0)) for seed in (4, 9)]
+    learner.update(learner.agent.phases[0], batches, 0)
+    assert [path for path, leaf in before if not leaf.is_deleted()] == []
 
 
 def test_metrics_are_means_over_the_steps_of_a_call(toy: Any) -> None:
