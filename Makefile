@@ -39,13 +39,13 @@ test: setup-dev
 	@$(BIN)/python -m pytest -q -n $(WORKERS) $(ARGS)
 
 test-slow: setup-dev
-	@XLA_FLAGS= $(BIN)/python -m pytest -q -m slow --timeout 3600 $(ARGS)
+	@XLA_FLAGS= JAX_DISABLE_MOST_OPTIMIZATIONS=0 $(BIN)/python -m pytest -q -m slow --timeout 3600 $(ARGS)
 
 test-extras: $(VENV)/.installed-extras
 	@$(BIN)/python -m pytest -q -m extras --timeout 600 $(ARGS)
 
 test-gpu: setup-dev
-	@$(BIN)/python -m pytest -q -m gpu --timeout 600 $(ARGS)
+	@JAX_PLATFORMS=cuda,cpu $(BIN)/python -m pytest -q -m gpu --timeout 600 $(ARGS)
 
 test-browser: setup-dev
 	@$(BIN)/python -m pytest -q -m browser $(ARGS)

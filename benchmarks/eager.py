@@ -156,22 +156,25 @@ class Agent:
         imagined_loss = ((along - expanded).square() * weights).sum() / weights.sum().clamp(min=1.0)
         critic_loss = critic_loss + s["imagined_weight"] * imagined_loss
         critic_gradients = torch.autograd.grad(critic_loss, [self.p[name] for name in self.critics])
-        self._step(1, self.critics, critic_gradients, s["critic_clip"])
+        critic_norm = self._step(1, self.critics, critic_gradients, s["critic_clip"])
         with torch.no_grad():
             for name in (*self.critics, *self.actor):  # before the actor's step, as in ours
                 self.p[f"target_{name}"].lerp_(self.p[name], s["target_update_rate"])
-        self._step(0, self.actor, gradients, s["actor_clip"])
-        return {"critic/loss": critic_loss.item(), "actor/objective": mean.item()}
+        actor_norm = self._step(0, self.actor, gradients, s["actor_clip"])
+        norms = {"critic/grad_norm": critic_norm.item(), "actor/grad_norm": actor_norm.item()}
+        return norms | {"critic/loss": critic_loss.item(), "actor/objective": mean.item()}
 
-    def _step(self, which: int, names: list[str], gradients: tuple[Tensor, ...], clip: float) -> None:
+    def _step(self, which: int, names: list[str], gradients: tuple[Tensor, ...], clip: float) -> Tensor:
+        """One step of Adam; returns the gradients' norm before it is clipped."""
         for name, gradient in zip(names, gradients, strict=True):
             self.p[name].grad = gradient
-        torch.nn.utils.clip_grad_norm_([self.p[name] for name in names], clip)
+        norm = torch.nn.utils.clip_grad_norm_([self.p[name] for name in names], clip)
         self.optimizers[which].step()
         with torch.no_grad():  # ours evaluates a running average of the actor
             if which == 0:
                 for name in names:
                     self.p[f"average_{name}"].lerp_(self.p[name], 0.01)
+        return norm
 
 
 def main() -> None:

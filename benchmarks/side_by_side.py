@@ -27,6 +27,7 @@ import numpy as np
 
 from mbdpg.agents.mbdpg import MBDPG
 from mbdpg.experiments.benchmark import PAPER_SIZES, TASK, made_up_batches, made_up_learner, phase_of, update_ms
+from mbdpg.storage.metrics import read_metrics
 from mbdpg.storage.run_folder import describe_machine
 from mbdpg.training.learner import Learner
 
@@ -55,7 +56,7 @@ def given_to(peer: Path, learner: Learner) -> Any:
 
 
 def check(learner: Learner, batches: Any, theirs: dict[str, Any]) -> None:
-    """Take the peer's first update, and compare what it said and what became of every parameter's norm.
+    """Take the peer's first update, and compare its losses, the norms of its gradients and of every parameter after it.
 
     Raises:
         SystemExit: they do not compute the same.
@@ -97,10 +98,10 @@ def updates(python: Path, rounds: int, threads: int) -> list[list[Any]]:
 
 
 def trainings(python: Path, steps: int, rounds: int, threads: int) -> list[list[Any]]:
-    """Seconds of whole trainings, start and evaluations included."""
+    """Seconds of whole trainings, start and evaluations included, and what they came to."""
     rows: list[list[Any]] = []
     with tempfile.TemporaryDirectory() as place:
-        common = ["--steps", str(steps)]
+        common = ["--steps", str(steps), "--evaluate-every", str(min(steps, 5000))]
         ours = [sys.executable, "-m", "mbdpg", "train", TASK, *common]
         peer = [str(python), str(HERE / "peers.py")]
         few = ["--random-steps", "4000"]
@@ -114,8 +115,17 @@ def trainings(python: Path, steps: int, rounds: int, threads: int) -> list[list[
                 began = time.monotonic()
                 subprocess.run([*command, "--out", str(out)], check=True, stdout=subprocess.DEVNULL)
                 rows.append([f"{steps:,} steps", name, turn, f"{time.monotonic() - began:.0f}", "s"])
-                print(*rows[-1], flush=True)
+                rows.append([f"{steps:,} steps", name, turn, f"{last_return(out):.0f}", "return"])
+                print(*rows[-2], *rows[-1], flush=True)
     return rows
+
+
+def last_return(out: Path) -> float:
+    """Of the last evaluation in our run folder, or in the peer's table."""
+    if out.is_dir():
+        return float(read_metrics(out / "seed-0", "eval")["eval/return_mean"][-1])
+    with open(out, newline="") as file:
+        return float(list(csv.DictReader(file))[-1]["return_mean"])
 
 
 def main() -> None:

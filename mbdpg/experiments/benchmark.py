@@ -83,13 +83,15 @@ def benchmark(say: Callable[[str], None], *, growth: bool = True) -> dict[str, A
         growth: also time the updates at other sizes and numbers of seeds.
 
     Returns:
-        Numbers by name, for JSON: times in the unit that the name ends with, rates in GFLOP/s, memory in MiB.
+        Numbers by name, for JSON: times in the unit that the name ends with, rates in GFLOP/s, memory in MiB. A
+        share is that of the update's own attainable rate; `attainable_gflops` is of both kinds of update together.
     """
     improve, fit = cost_of("improving", PAPER_SIZES), cost_of("fitting", PAPER_SIZES)
     rate = (improve.gflop + fit.gflop) / (improve.gflop / improve.attainable_gflops + fit.gflop / fit.attainable_gflops)
     result: dict[str, Any] = {"attainable_gflops": rate}
     for name, cost in (("improve", improve), ("fit", fit)):
         result |= {f"{name}_ms": cost.ms, f"{name}_gflop": cost.gflop, f"{name}_share": cost.share}
+        result[f"{name}_attainable_gflops"] = cost.attainable_gflops
         say(
             f"{name}: {cost.ms:.1f} ms, {cost.gflop:.2f} GFLOP, {100 * cost.share:.0f} % of the "
             f"{cost.attainable_gflops:.0f} GFLOP/s that its matrix products attain by themselves"
@@ -190,7 +192,10 @@ def _starting(say: Callable[[str], None]) -> dict[str, float]:
         for name in ("cold_start_s", "warm_start_s"):
             command = [sys.executable, "-c", code, settings, str(REPLAY_ROWS), str(time.time())]
             done = subprocess.run(command, env=os.environ | keep, stdout=subprocess.PIPE, text=True, check=True)
-            result |= {name: (measured := json.loads(done.stdout))["seconds"], "peak_memory_mb": measured["memory_mb"]}
+            measured = json.loads(done.stdout)
+            # Of both, the one that compiles takes more.
+            result |= {name: measured["seconds"]}
+            result["peak_memory_mb"] = max(result.get("peak_memory_mb", 0.0), measured["memory_mb"])
     say(f"from the start to the first updates: {result['cold_start_s']:.1f} s, compiled {result['warm_start_s']:.1f} s")
     say(f"peak memory with {REPLAY_ROWS:,} steps: {result['peak_memory_mb']:.0f} MiB")
     return result

@@ -123,9 +123,10 @@ def seed_mesh(seeds: int, devices: Sequence[jax.Device]) -> Mesh:
 def over_seeds(function: Any, mesh: Mesh) -> Any:
     """Map a one-seed function over leading seed axes, each device its own seeds.
 
-    On CPU one seed after the other, which computes for each exactly what it would alone; elsewhere all at once.
+    On CPU one seed after the other, which computes for each exactly what it would alone; elsewhere all at once, with
+    products of float32: a GPU's default rounds what it multiplies to ten bits, and imagination feeds errors back.
     """
-    each = jax.vmap(function) if jax.default_backend() != "cpu" else _one_by_one(function)
+    each = _one_by_one(function) if jax.default_backend() == "cpu" else jax.vmap(_in_float32(function))
     if mesh.size == 1:
         return each
     # Seeds tell each other nothing, so that there is nothing to check of what varies over devices.
@@ -135,6 +136,14 @@ def over_seeds(function: Any, mesh: Mesh) -> Any:
 
 def _one_by_one(function: Any) -> Any:
     return lambda *args: jax.lax.map(lambda packed: function(*packed), args)
+
+
+def _in_float32(function: Any) -> Any:
+    def traced(*args: Any) -> Any:
+        with jax.default_matmul_precision("float32"):
+            return function(*args)
+
+    return traced
 
 
 def _compile(phase: Phase, mesh: Mesh) -> Any:

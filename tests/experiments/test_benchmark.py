@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from mbdpg.agents import mbdpg
@@ -88,7 +89,10 @@ def test_everything_is_measured_and_written(
     numbers = json.loads((tmp_path / "numbers.json").read_text())
     for name in ("improve_ms", "improve_gflop", "fit_ms", "fit_gflop", "attainable_gflops", "policy_us"):
         assert numbers[name] > 0, name
-    assert 0 < numbers["improve_share"] < 1.5 and 0 < numbers["fit_share"] < 1.5
+    for name in ("improve", "fit"):
+        rate = numbers[f"{name}_gflop"] / (numbers[f"{name}_ms"] * 1e-3)
+        assert 0 < numbers[f"{name}_share"] < 1.5
+        np.testing.assert_allclose(rate / numbers[f"{name}_attainable_gflops"], numbers[f"{name}_share"], rtol=1e-6)
     assert 0 < numbers["warm_start_s"] < numbers["cold_start_s"] and numbers["peak_memory_mb"] > 100
     assert numbers["growth_ms"]["seeds"]["improving"]["2"] > 0 and numbers["growth_ms"]["seeds"]["fitting"]["2"] > 0
     said = capsys.readouterr().out

@@ -150,6 +150,27 @@ def test_seeds_shared_by_two_devices_learn_what_each_learns_alone_but_for_roundi
     assert same(shared.snapshot(0), kept[0]) and same(shared.snapshot(1), kept[1])
 
 
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", MAKERS)
+def test_an_accelerator_learns_what_the_cpu_learns_but_for_rounding(name: str) -> None:
+    learners = []
+    for device in (jax.devices()[0], jax.devices("cpu")[0]):
+        with jax.default_device(device):
+            learners.append(Learner(MAKERS[name](), [4, 9]))
+            learn(learners[-1], [4, 9])
+    assert {leaf.device for leaf in jax.tree.leaves(learners[0].state)} == {jax.devices()[0]}
+    for seed in range(2):
+        same_but_for_rounding(*(learner.snapshot(seed) for learner in learners))
+
+
+def test_products_on_an_accelerator_are_of_float32_and_not_of_what_it_takes_for_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    mapped = learner_module.over_seeds(lambda x: x @ x, learner_module.seed_mesh(1, ONE))
+    assert str(jax.make_jaxpr(mapped)(np.ones((2, 3, 3), np.float32))).count("HIGHEST") == 2
+
+
 @pytest.mark.parametrize(("seeds", "used"), [(1, 1), (2, 2), (3, 1), (4, 2)])
 def test_seeds_are_shared_by_as_many_devices_as_get_equally_many(seeds: int, used: int) -> None:
     assert learner_module.seed_mesh(seeds, BOTH).size == used
