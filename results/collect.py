@@ -2,8 +2,9 @@
 
     python results/collect.py NAME RUN...     # run folders; without any, what NAME.csv has already
 
-NAME.csv has every evaluation of the runs, NAME.png every seed's curve and the mean over seeds. Printed are, per
-algorithm and budget: seeds, mean, standard deviation, and interquartile mean with its 95 % bootstrap interval.
+NAME.csv has every evaluation of the runs, NAME.png every seed's curve and the mean over seeds, beside those of the
+rivals that were run on the same task (RIVALS). Printed are, per algorithm and budget: seeds, mean, standard deviation,
+and interquartile mean with its 95 % bootstrap interval.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ from matplotlib import pyplot as plt
 
 HERE = Path(__file__).parent
 BUDGETS = (50_000, 100_000)
+RIVALS = ("mbpo", "peers")
+"""Files whose runs of ours on the same task are drawn beside those of NAME.csv."""
 COLUMNS = (
     "env_steps",
     "eval/return_mean",
@@ -44,6 +47,9 @@ COLUMNS = (
     "actor/grad_norm_k01",
     "actor/grad_norm_k05",
 )
+
+LINES, MARKS = ("-", "--", "-.", ":"), "osD^vP"
+"""Of others' curves, and of single numbers of theirs."""
 
 Curves = dict[str, dict[int, float]]
 """Return by environment step, by seed."""
@@ -67,11 +73,22 @@ def collect(name: str, runs: list[Path]) -> None:
 def read(name: str) -> tuple[str, dict[str, Curves]]:
     """The task of NAME.csv, and its learning curves by algorithm."""
     curves: dict[str, Curves] = defaultdict(lambda: defaultdict(dict))
+    env = _add(curves, name, None)
+    for rival in RIVALS:
+        _add(curves, rival, env)
+    return env, curves
+
+
+def _add(curves: dict[str, Curves], name: str, env: str | None) -> str:
+    """Add what a file has of a task, by default that of its first row; returns the task."""
     with open(HERE / f"{name}.csv", newline="") as file:
         for row in csv.DictReader(file):
-            curves[row["algorithm"]][row["seed"]][int(row["env_steps"])] = float(row["eval/return_mean"])
-            env = row["env"]
-    return env, curves
+            env = env or row["env"]
+            if row["env"] == env and row.get("program", "mbdpg") == "mbdpg":
+                score = row["eval/return_mean"] if "eval/return_mean" in row else row["return_mean"]
+                curves[row["algorithm"]][row["seed"]][int(row["env_steps"])] = float(score)
+    assert env is not None
+    return env
 
 
 def tell(curves: dict[str, Curves]) -> None:
@@ -80,8 +97,10 @@ def tell(curves: dict[str, Curves]) -> None:
         for budget in BUDGETS:
             if scores := [curve[budget] for curve in seeds.values() if budget in curve]:
                 s = summarize(scores)
-                middle = f"{s.interquartile_mean:,.0f} [{s.low:,.0f}, {s.high:,.0f}]"
-                print(f"| {algorithm} | {budget:,} | {s.seeds} | {s.mean:,.0f} ± {s.std:,.0f} | {middle} |")
+                mean, middle = f"{s.mean:,.0f}", f"{s.interquartile_mean:,.0f}"
+                if s.seeds > 1:
+                    mean, middle = f"{mean} ± {s.std:,.0f}", f"{middle} [{s.low:,.0f}, {s.high:,.0f}]"
+                print(f"| {algorithm} | {budget:,} | {s.seeds} | {mean} | {middle} |")
 
 
 def draw(name: str, env: str, curves: dict[str, Curves]) -> None:
@@ -99,8 +118,12 @@ def draw(name: str, env: str, curves: dict[str, Curves]) -> None:
         for row in csv.DictReader(file):
             if row["env"] == env.rpartition("-v")[0]:
                 others[row["method"], row["id"]].append((int(row["env_steps"]), float(row["mean"])))
-    for marker, ((method, version), points) in zip("osD^vP", others.items(), strict=False):
-        axes.plot(*zip(*points, strict=True), marker, color="0.35", fillstyle="none", label=f"{method} ({version})")
+    for style, ((method, version), points) in enumerate(others.items()):
+        kind = (
+            {"linestyle": LINES[style % len(LINES)]} if len(points) > 2 else {"linestyle": "", "marker": MARKS[style]}
+        )
+        label = f"{method} ({version}, published)"
+        axes.plot(*zip(*points, strict=True), color="0.35", fillstyle="none", linewidth=1, label=label, **kind)
     axes.set(xlabel="environment steps", ylabel="evaluation return", title=env)
     axes.grid(alpha=0.3)
     axes.legend(fontsize="small")
