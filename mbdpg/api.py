@@ -79,7 +79,7 @@ def resume(
         UserError: not a run, or damaged beyond its checkpoints.
     """
     on_update = _only_evaluations(on_evaluation)
-    run.resume(Path(path), make_env=_maker(env), steps=steps, watch=lambda config, env_steps: on_update)
+    run.resume([Path(path)], make_env=_maker(env), steps=steps, watch=lambda *_: on_update)
 
 
 def load_policy(path: str | Path, *, best: bool = False) -> NumpyPolicy | PlanningPolicy:

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -88,18 +89,16 @@ def _resume(args: list[str]) -> None:
     if flags.run.is_dir() and not (flags.run / "config.json").exists():
         runs = sorted(path.parent for path in flags.run.glob("seed-*/config.json")) or runs
     with Stop() as stop:
-        for run in runs:
-            with contextlib.ExitStack() as stack:
+        with contextlib.ExitStack() as displays:
 
-                def display(
-                    config: RunConfig, env_steps: int, run: Path = run, stack: contextlib.ExitStack = stack
-                ) -> RunDisplay:
-                    if env_steps >= config.schedule.steps:
-                        print(f"{run} has its {env_steps:,} steps already; --steps makes it longer")
-                    return stack.enter_context(RunDisplay(config.schedule.steps, done=env_steps))
+            def display(going: Sequence[Path], config: RunConfig, env_steps: int) -> RunDisplay:
+                displays.close()  # of those before
+                if env_steps >= config.schedule.steps:
+                    print(f"{', '.join(map(str, going))} has its {env_steps:,} steps already; --steps makes it longer")
+                return displays.enter_context(RunDisplay(config.schedule.steps, done=env_steps))
 
-                resume(run, steps=flags.steps, allow_import=flags.allow_import, watch=display, should_stop=stop)
-            stop.exit_if_asked(f"{program()} resume {flags.run}")
+            resume(runs, steps=flags.steps, allow_import=flags.allow_import, watch=display, should_stop=stop)
+        stop.exit_if_asked(f"{program()} resume {flags.run}")
     config = RunFolder.open(runs[0]).config
     finish(runs, config["algorithm"], config["env"])
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import json
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from mbdpg.agents import mbdpg, mbpo, pets, sac, td3
 from mbdpg.dynamics.planning import PlanningPolicy, is_planner, planner_of
@@ -81,55 +83,105 @@ def train(
 
 
 def resume(
-    path: Path,
+    runs: Sequence[Path],
     *,
     make_env: MakeEnvironment | None = None,
     steps: int | None = None,
     allow_import: bool = False,
-    watch: Callable[[RunConfig, int], OnUpdate] = lambda config, env_steps: lambda update: None,
+    watch: Callable[[Sequence[Path], RunConfig, int], OnUpdate] = lambda runs, config, env_steps: lambda update: None,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Go on with one run exactly where its newest undamaged checkpoint is.
+    """Go on with runs, each exactly where its newest undamaged checkpoint is.
+
+    Runs that differ in nothing but their seed and stand at the same place go on at once, as they were begun.
 
     Args:
-        path: the run folder.
-        make_env: as for `train`; needed if the run was given one.
-        steps: environment steps of the whole run, if it shall be longer than it was meant to be.
+        runs: the run folders.
+        make_env: as for `train`; needed if a run was given one.
+        steps: environment steps of each whole run, if it shall be longer than it was meant to be.
         allow_import: allow an id of the form module:Id, whatever the folder says: it may come from a stranger.
-        watch: given the run's config and the step it goes on from, returns what `train` calls `on_update`.
+        watch: given runs that go on at once, their config and the step they go on from, returns what `train` calls
+            `on_update`.
         should_stop: as for `train`.
 
     Raises:
         UserError: not a run, damaged beyond its checkpoints, or of another configuration or environment.
     """
+    with contextlib.ExitStack() as stack:
+        together: dict[str, list[_Saved]] = defaultdict(list)
+        for path in runs:
+            saved = _saved(path, stack, make_env is not None, steps, allow_import)
+            together[saved.place].append(saved)
+        for group in together.values():
+            if not should_stop():
+                _go_on(group, make_env or group[0].config.make_env, watch, should_stop)
+
+
+class _Saved(NamedTuple):
+    """A run that is to go on."""
+
+    folder: RunFolder
+    config: RunConfig
+    checkpoint: Checkpoint
+
+    @property
+    def place(self) -> str:
+        """The same for runs that can go on at once."""
+        facts = {name: self.checkpoint.facts.get(name) for name in ("updates", "recorded", "expert_env_steps")}
+        return json.dumps([self.config.to_json(), self.checkpoint.env_steps, facts], sort_keys=True)
+
+
+def _saved(path: Path, stack: contextlib.ExitStack, has_env: bool, steps: int | None, allow_import: bool) -> _Saved:
+    """Lock and read a run."""
     folder = RunFolder.open(path)
     try:
         config = RunConfig.from_json(folder.config)
     except UserError as error:
         raise UserError(f"{path} cannot be resumed, {error}; put its config.json back as it was") from error
     config = dataclasses.replace(config, env_options=dataclasses.replace(config.env_options, allow_import=allow_import))
-    if folder.config.get("custom_env") and make_env is None:
+    if folder.config.get("custom_env") and not has_env:
         raise UserError(f"{path} trained an environment made in code; resume it with mbdpg.resume(..., env=...)")
-    make = make_env or config.make_env
+    stack.enter_context(folder.locked())
+    checkpoint = load_checkpoint(path)
+    with _as_written_by_us([path], checkpoint.env_steps):
+        planned = max(int(checkpoint.facts["steps"]), config.schedule.steps)
+    require(
+        steps is None or steps >= checkpoint.env_steps,
+        f"--steps is {steps}, but {path} has {checkpoint.env_steps} behind it; expected at least as many",
+    )
+    schedule = dataclasses.replace(config.schedule, steps=planned if steps is None else steps)
+    return _Saved(folder, dataclasses.replace(config, schedule=schedule), checkpoint)
+
+
+def _go_on(
+    group: Sequence[_Saved],
+    make: MakeEnvironment,
+    watch: Callable[[Sequence[Path], RunConfig, int], OnUpdate],
+    should_stop: Callable[[], bool],
+) -> None:
+    """Train on, all in this process."""
+    paths, config, checkpoints = [s.folder.path for s in group], group[0].config, [s.checkpoint for s in group]
+    spec = _spec_of(make)
     with contextlib.ExitStack() as stack:
-        stack.enter_context(folder.locked())
-        checkpoint, spec = load_checkpoint(path), _spec_of(make)
-        try:
-            planned = max(int(checkpoint.facts["steps"]), config.schedule.steps)
-            require(
-                steps is None or steps >= checkpoint.env_steps,
-                f"--steps is {steps}, but {path} has {checkpoint.env_steps} behind it; expected at least as many",
-            )
-            schedule = dataclasses.replace(config.schedule, steps=planned if steps is None else steps)
-            config = dataclasses.replace(config, schedule=schedule)
-            recorders = [Recorder(folder, checkpoint)]
-            training = _compose(config, spec, make, [_seed_of(folder)], recorders, stack, None, checkpoint)
-        except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
-            raise UserError(
-                f"the checkpoint of {path} at {checkpoint.env_steps} steps is not one that mbdpg wrote ({error!r})"
-            ) from error
-        _say_what_changed(path, folder.config.get("machine"))
-        training.run(watch(config, training.env_steps), should_stop)
+        with _as_written_by_us(paths, checkpoints[0].env_steps):
+            recorders = [Recorder(s.folder, s.checkpoint) for s in group]
+            seeds = [_seed_of(s.folder) for s in group]
+            training = _compose(config, spec, make, seeds, recorders, stack, None, checkpoints)
+        for s in group:
+            _say_what_changed(s.folder.path, s.folder.config.get("machine"))
+        training.run(watch(paths, config, training.env_steps), should_stop)
+
+
+@contextlib.contextmanager
+def _as_written_by_us(runs: Sequence[Path], env_steps: int) -> Iterator[None]:
+    """Whatever a stranger's checkpoint makes fail is said in one line."""
+    try:
+        yield
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        names = ", ".join(map(str, runs))
+        raise UserError(
+            f"the checkpoint of {names} at {env_steps} steps is not one that mbdpg wrote ({error!r})"
+        ) from error
 
 
 def load_policy(path: Path, *, best: bool = False, spec: EnvSpec | None = None) -> NumpyPolicy | PlanningPolicy:
@@ -184,18 +236,18 @@ def _compose(
     recorders: Sequence[Recorder],
     stack: contextlib.ExitStack,
     demonstrations: Demonstrations | None,
-    checkpoint: Checkpoint | None = None,
+    checkpoints: Sequence[Checkpoint] = (),
 ) -> Training:
-    """Put a run together, from the beginning or from a checkpoint (then of one seed)."""
+    """Put a run together, from the beginning or from a checkpoint of every seed."""
     for recorder in recorders:
         stack.callback(recorder.close)
     agent = make_agent(config, spec)
     collectors = []
-    for seed in seeds:
+    for index, seed in enumerate(seeds):
         replay = Replay(spec.observation_size, spec.action_size)
-        if checkpoint:
-            replay = Replay.from_columns(checkpoint.replay)
-            replay.demonstrated = checkpoint.facts["demonstrated"]
+        if checkpoints:
+            replay = Replay.from_columns(checkpoints[index].replay)
+            replay.demonstrated = checkpoints[index].facts["demonstrated"]
         elif demonstrations:
             replay.extend(demonstrations.replay.columns())
             replay.demonstrated = replay.size
@@ -218,8 +270,8 @@ def _compose(
         config.schedule,
         expert_env_steps=demonstrations.expert_env_steps if demonstrations else 0,
     )
-    if checkpoint:
-        training.restore(checkpoint.env_steps, [checkpoint.arrays], [checkpoint.facts])
+    if checkpoints:
+        training.restore(checkpoints[0].env_steps, [c.arrays for c in checkpoints], [c.facts for c in checkpoints])
     return training
 
 

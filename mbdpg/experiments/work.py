@@ -45,15 +45,16 @@ class Training:
             UserError: a run folder has other settings, or is none.
         """
         keep_compilations()
+        steps, begun = self.config.schedule.steps, []
         for run in self.runs():
             if run.exists() and not any((run / "checkpoints").glob("[0-9]*")):
                 discard_unbegun(run)
             if run.exists():
                 same = _is_of(run, self.config)
                 require(same, f"{run} has other settings than this one's; move it away, or choose another --out")
-                if steps_evaluated(run) < self.config.schedule.steps:
-                    steps = self.config.schedule.steps
-                    resume(run, steps=steps, watch=lambda *_: on_update, should_stop=should_stop)
+                if steps_evaluated(run) < steps:
+                    begun.append(run)
+        resume(begun, steps=steps, watch=lambda *_: on_update, should_stop=should_stop)
         fresh = [seed for seed, run in zip(self.seeds, self.runs(), strict=True) if not run.exists()]
         if fresh and not should_stop():
             train(self.config, seeds=fresh, out=self.out, on_update=on_update, should_stop=should_stop)
