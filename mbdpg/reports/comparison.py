@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from mbdpg.interfaces import require
-from mbdpg.reports.record import Curve, Record
+from mbdpg.reports.record import Curve, Record, setting, text
 from mbdpg.reports.statistics import Summary, probability_of_improvement, summarize
 
 LOOKS_ON = {"steps", "evaluate_every", "evaluation_episodes", "log_every", "checkpoint_every"}
@@ -45,30 +44,35 @@ def run_folders(paths: Sequence[Path]) -> list[Path]:
 
 def grouped(runs: Sequence[Record]) -> dict[str, dict[str, list[Record]]]:
     """Runs of the same settings: for each environment, those by a label that tells groups apart."""
-    groups: dict[str, dict[str, list[Record]]] = defaultdict(lambda: defaultdict(list))
-    settings: dict[str, dict[str, Any]] = {}
+    found: dict[str, dict[_Settings, list[Record]]] = defaultdict(lambda: defaultdict(list))
     for run in runs:
-        config = run.config
-        flat = {"algorithm": config.get("algorithm"), "demonstrations": config.get("demonstrations")}
-        for part in ("agent", "env_options", "schedule"):
-            values = config.get(part)
-            flat |= values if isinstance(values, dict) else {}
-        flat = {name: value for name, value in flat.items() if name not in LOOKS_ON}
-        key = json.dumps(flat, sort_keys=True)
-        settings[key] = flat
-        groups[str(config.get("env"))][key].append(run)
-    return {env: _labelled(own, settings) for env, own in groups.items()}
+        found[str(run.config.get("env"))][_settings(run)].append(run)
+    return {env: _labelled(groups) for env, groups in found.items()}
 
 
-def _labelled(groups: dict[str, list[Record]], settings: dict[str, dict[str, Any]]) -> dict[str, list[Record]]:
+_Settings = tuple[tuple[str, str], ...]
+"""Names and values as text, as a label shows them, so that whatever tells groups apart can be seen in their labels."""
+
+
+def _settings(run: Record) -> _Settings:
+    """What the run learned with; a setting that is None is one that is absent."""
+    flat = {"algorithm": run.config.get("algorithm"), "demonstrations": run.config.get("demonstrations")}
+    for part in ("agent", "env_options", "schedule"):
+        flat |= setting(run.config, part)
+    return tuple((name, text(flat[name])) for name in sorted(flat.keys() - LOOKS_ON) if flat[name] is not None)
+
+
+def _labelled(groups: Mapping[_Settings, list[Record]]) -> dict[str, list[Record]]:
     """Each group's algorithm, and those of its settings in which another group of that algorithm differs."""
-    labels = {}
-    for key, runs in groups.items():
-        own = settings[key]
-        peers = [settings[other] for other in groups if settings[other]["algorithm"] == own["algorithm"]]
-        differing = sorted(name for name in own if any(peer.get(name) != own[name] for peer in peers))
-        labels[" ".join([str(own["algorithm"]), *(f"{name}={own[name]}" for name in differing)])] = runs
-    return labels
+    labels: dict[str, list[Record]] = defaultdict(list)
+    for settings, runs in groups.items():
+        own = dict(settings)
+        algorithm = own.get("algorithm", text(None))
+        peers = [peer for peer in map(dict, groups) if peer.get("algorithm") == own.get("algorithm")]
+        differing = (name for name in own if any(peer.get(name) != own[name] for peer in peers))
+        # Added to: a stranger's text may make two labels one, and no run is to be lost to that.
+        labels[" ".join([algorithm, *(f"{name}={own[name]}" for name in differing)])] += runs
+    return dict(labels)
 
 
 def compare(curves: Mapping[str, Sequence[Curve]], *, at: int | None = None) -> list[Row]:

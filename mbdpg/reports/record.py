@@ -144,10 +144,19 @@ def setting(config: Mapping[str, Any], name: str) -> dict[str, Any]:
 
 
 def text(value: object) -> str:
-    """A setting as a person writes it: absent is a dash."""
+    """A setting as a person writes it: absent is a dash, and 1.0 is 1."""
     if isinstance(value, str):
         return value
-    return "—" if value is None else json.dumps(value, sort_keys=True)
+    return "—" if value is None else json.dumps(_whole(value), sort_keys=True)
+
+
+def _whole(value: Any) -> Any:
+    """JSON whose numbers without a fraction are integers, so that what is equal looks equal."""
+    if isinstance(value, list | tuple):
+        return list(map(_whole, value))
+    if isinstance(value, dict):
+        return {str(name): _whole(own) for name, own in value.items()}
+    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def _curve(evaluations: Mapping[str, list[Any]]) -> Curve:

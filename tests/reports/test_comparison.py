@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -31,6 +32,31 @@ def test_runs_are_grouped_by_everything_but_their_seed_and_named_by_what_differs
         "E-v0": {"td3 width=8": same, "td3 width=16": [wide], "sac": [sac]},
         "F-v0": {"td3": [other]},
     }
+
+
+@pytest.mark.parametrize(("one", "other"), [(1, 1.0), (None, None), ([2, {"a": 3.0}], [2.0, {"a": 3}]), ("8", 8)])
+def test_no_run_is_lost_where_equal_settings_are_written_differently(
+    tmp_path: Path, make: Make, one: Any, other: Any
+) -> None:
+    """Two groups had one label, and the first of them was not in the report."""
+    same = [make(tmp_path / "a", {0: 1.0}, discount=one), make(tmp_path / "b", {0: 1.0}, discount=other)]
+    absent = [make(tmp_path / "c", {0: 1.0}, momentum=None), make(tmp_path / "d", {0: 1.0})]
+    groups = grouped(read_records([*same, *absent], leave_out=pytest.fail))["E-v0"]
+    names = {label: [run.name for run in own] for label, own in groups.items()}
+    assert list(names.values()) == [["a", "b"], ["c", "d"]] and list(names)[1] == "td3 discount=0.9"
+
+
+def test_no_run_is_lost_where_two_labels_are_one(tmp_path: Path, make: Make) -> None:
+    odd = [
+        make(tmp_path / "a", {0: 1.0}, algorithm="a b=1", c=1),
+        make(tmp_path / "b", {0: 1.0}, algorithm="a b=1", c=2),
+    ]
+    plain = [
+        make(tmp_path / "c", {0: 1.0}, algorithm="a", b="1 c=1"),
+        make(tmp_path / "d", {0: 1.0}, algorithm="a", b=2),
+    ]
+    groups = grouped(read_records([*odd, *plain], leave_out=pytest.fail))["E-v0"]
+    assert sorted(run.name for own in groups.values() for run in own) == ["a", "b", "c", "d"]
 
 
 def curves(groups: dict[str, list[Path]]) -> dict[str, list[Curve]]:
