@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import json
 import shutil
@@ -97,11 +96,11 @@ class Browser:
             self._loaded += 1
         return message
 
-    def open(self, page: Path, *, width: int = 1000, height: int = 900, dark: bool = False, scale: float = 1) -> None:
+    def open(self, page: Path, *, width: int = 1000, height: int = 900, dark: bool = False) -> None:
         """Load a file into a window of this size."""
         self.errors.clear()
         self.requests.clear()
-        metrics = {"width": width, "height": height, "deviceScaleFactor": scale, "mobile": False}
+        metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         self.ask("Emulation.setDeviceMetricsOverride", **metrics)
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.ask("Emulation.setEmulatedMedia", features=[scheme])
@@ -144,10 +143,6 @@ class Browser:
         text = {"Enter": {"text": "\r"}, " ": {"text": " "}}.get(key, {})
         for kind in ("keyDown", "keyUp"):
             self.ask("Input.dispatchKeyEvent", type=kind, key=key, windowsVirtualKeyCode=code, **text)
-
-    def picture(self) -> bytes:
-        """What the window shows, as PNG."""
-        return base64.b64decode(self.ask("Page.captureScreenshot", format="png")["data"])
 
     def __enter__(self) -> Browser:
         return self
