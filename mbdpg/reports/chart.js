@@ -80,14 +80,15 @@ function runPoints(group, series, state) {
   });
 }
 
-/** Points of the mean over the runs, where all of them have one. */
+/** Points of the mean over the runs, at the steps that all of them have; y is null where one of them has a gap. */
 function meanPoints(runs) {
-  const tables = runs.map((points) => new Map(points.filter((point) => known(point.y)).map((point) => [point.step, point])));
+  const tables = runs.map((points) => new Map(points.map((point) => [point.step, point])));
   if (!tables.length) return [];
   const steps = [...tables[0].keys()].filter((step) => tables.every((table) => table.has(step)));
   return steps.map((step) => {
     const here = tables.map((table) => table.get(step)), ys = here.map((point) => point.y);
-    return { x: mean(here.map((point) => point.x)), y: mean(ys), low: Math.min(...ys), high: Math.max(...ys), count: ys.length };
+    const x = mean(here.map((point) => point.x));
+    return ys.every(known) ? { x, y: mean(ys), low: Math.min(...ys), high: Math.max(...ys), count: ys.length } : { x, y: null };
   });
 }
 
@@ -153,6 +154,10 @@ function path(points, scales) {
   }).join("");
 }
 
+/** Points with a gap on either side, of which a path shows nothing. */
+const lonely = (points) => points.filter((point, index) =>
+  known(point.y) && !known(points[index - 1]?.y) && !known(points[index + 1]?.y));
+
 function picture(visible, scales, chart, state) {
   const { width, height, margin, inner } = scales;
   const root = shape("svg", {
@@ -166,20 +171,22 @@ function picture(visible, scales, chart, state) {
     shape("text", { class: "x", x: scales.x(tick), y: height - 6 }, format(tick, scales.xStep)));
   if (known(chart.reference)) root.append(
     shape("line", { class: "reference", x1: margin.left, x2: margin.left + inner.width, y1: scales.y(chart.reference), y2: scales.y(chart.reference) }));
-  const stroke = (one, kind, points) => root.append(colored(
-    shape("path", { class: `${kind}${one.second ? " dashed" : ""}`, "data-group": one.index, d: path(points, scales) }), one.index));
+  const stroke = (one, kind, points) => {
+    if (!points.some((point) => known(point.y))) return;
+    const look = { class: `${kind}${one.second ? " dashed" : ""}`, "data-group": one.index };
+    root.append(colored(shape("path", { ...look, d: path(points, scales) }), one.index));
+    const dot = { class: `dot ${kind}`, "data-group": one.index, r: kind === "mean" ? 3 : 2 };
+    for (const point of lonely(points)) root.append(
+      colored(shape("circle", { ...dot, cx: scales.x(point.x), cy: scales.y(point.y) }), one.index));
+  };
   for (const one of visible) if (one.runs.length > 1) one.runs.forEach((points) => stroke(one, "run", points));
-  for (const one of visible.filter((other) => other.mean.length)) {
-    stroke(one, "mean", one.mean);
-    if (one.mean.length === 1) root.append(colored(  // a path of one point is invisible
-      shape("circle", { class: "dot", cx: scales.x(one.mean[0].x), cy: scales.y(one.mean[0].y), r: 3 }), one.index));
-  }
+  for (const one of visible) stroke(one, "mean", one.mean);
   return root;
 }
 
 /** Values at the pointer, or at the place that the arrow keys moved to. */
 function readable(root, visible, scales, tooltip, state) {
-  const places = [...new Set(visible.flatMap((one) => one.mean.map((point) => point.x)))].sort((a, b) => a - b);
+  const places = [...new Set(visible.flatMap((one) => one.mean.filter((point) => known(point.y)).map((point) => point.x)))].sort((a, b) => a - b);
   const marks = shape("g", { class: "marks" });
   root.append(marks);
   let place = null;
@@ -190,8 +197,10 @@ function readable(root, visible, scales, tooltip, state) {
     const step = scales.xStep / 100, pixel = scales.x(x), lines = [];
     marks.replaceChildren(shape("line", { class: "cursor", x1: pixel, x2: pixel, y1: scales.margin.top, y2: scales.margin.top + scales.inner.height }));
     for (const one of visible) {
-      if (!one.mean.length || x < one.mean[0].x || x > one.mean.at(-1).x) continue;
+      const there = one.mean.filter((other) => known(other.y));
+      if (!there.length || x < there[0].x || x > there.at(-1).x) continue;
       const point = nearest(one.mean, x, (other) => other.x);
+      if (!known(point.y)) continue;  // in a gap
       marks.append(colored(shape("circle", { class: "dot", cx: scales.x(point.x), cy: scales.y(point.y), r: 3.5 }), one.index));
       const notes = [];
       if (point.count > 1) notes.push(`${scales.read(point.low)} to ${scales.read(point.high)}`);

@@ -271,12 +271,36 @@ def test_the_slider_smooths(browser: Browser, shown: Path) -> None:
     assert browser.get(turns) < rough / 2
 
 
-def test_a_gap_is_a_gap(browser: Browser, shown: Path) -> None:
-    browser.open(shown)
-    paths = browser.get(
-        "[...document.querySelector('svg').querySelectorAll('path.mean')].map((p) => p.getAttribute('d'))"
-    )
-    assert all(path.startswith("M") and "NaN" not in path for path in paths)
+def test_no_line_crosses_an_evaluation_that_failed(browser: Browser, tmp_path: Path, make: Callable[..., Path]) -> None:
+    """A mean, also that of a single run, went straight on from the evaluation before to the one after."""
+    steps, nan = range(0, 801, 100), float("nan")
+    make(tmp_path / "a-0", dict.fromkeys(steps, 1.0), algorithm="pair")
+    make(tmp_path / "a-1", {step: 2.0 if step not in (300, 500) else nan for step in steps}, algorithm="pair")
+    make(tmp_path / "b", {step: 3.0 if step != 700 else nan for step in steps}, algorithm="single")
+    runs = read_records(run_folders([tmp_path]), leave_out=pytest.fail)
+    write_page(tmp_path / "page.html", contents(compared(runs, at=None)))
+    browser.open(tmp_path / "page.html")
+    assert browser.errors == []
+
+    def drawn(kind: str, group: int) -> list[list[int]]:
+        """How many points each part of each line has: a point that is alone is a part of one."""
+        paths = browser.get(
+            f"[...document.querySelector('svg').querySelectorAll('path.{kind}[data-group=\"{group}\"]')]"
+            ".map((path) => path.getAttribute('d'))"
+        )
+        return [[part.count("L") + 1 for part in path.split("M")[1:]] for path in paths]
+
+    assert drawn("mean", 0) == [[3, 1, 3]] and drawn("run", 0) == [[9], [3, 1, 3]]
+    assert drawn("mean", 1) == [[7, 1]] and drawn("run", 1) == []
+    dots = "[...document.querySelector('svg').querySelectorAll('circle')].map((dot) => dot.getAttribute('class'))"
+    assert browser.get(dots) == ["dot run colored", "dot mean colored", "dot mean colored"]  # a path shows none of them
+    tooltip = "document.querySelector('.tooltip').innerText"
+    browser.do("document.querySelector('svg').focus()")
+    for _ in range(4):
+        browser.press("ArrowRight")
+    assert "300 environment steps" in browser.get(tooltip) and "pair" not in browser.get(tooltip)
+    browser.press("ArrowRight")
+    assert "pair" in browser.get(tooltip) and "1.000 to 2.000" in browser.get(tooltip)
 
 
 @pytest.mark.parametrize("dark", [False, True])
