@@ -457,7 +457,7 @@ def test_report_compares_runs_in_tables_and_on_a_page(say: Any, toys: None) -> N
     assert Path("new/page.html").read_text().startswith("<!DOCTYPE html>")
     check_refused(say("report", "new"), "new is no run folder and has none in it")
     check_refused(
-        say("report", "runs", "--at", "30"), "--at is 30, expected a step at which all were evaluated: 0, 20, 40"
+        say("report", "runs", "--at", "30"), "--at is 30, expected a step at which a run was evaluated: 0, 20, 40"
     )
     check_refused(say("report"), "expected run folders")
 

@@ -23,7 +23,8 @@ class Report:
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN...")]
     """Run folders, or folders that hold some."""
     at: int | None = None
-    """Environment steps at which they are compared; by default the last at which all were evaluated."""
+    """Environment steps at which they are compared, without runs that were not evaluated there; by default the last at
+    which all were."""
     out: Path | None = None
     """HTML file for curves, tables, diagnostics, settings and videos, which needs no network; by default none."""
     debug: bool = False
@@ -42,10 +43,10 @@ def report(args: list[str]) -> None:
         print(_harmless(f"left out: {reason}"))
     require(len(runs) > 0, "no run is left to report")
     environments = compared(runs, at=flags.at)
+    # Without a common step a page still has the curves.
+    require(flags.out is not None or any(environment.rows for environment in environments), NO_COMMON_STEP)
     for environment in environments:
-        # Without a common step the page still has the curves, and says what is missing.
-        lines = table(environment.rows) if environment.rows or flags.out is None else [NO_COMMON_STEP]
-        print("\n".join(map(_harmless, (environment.name, *lines))))
+        print("\n".join(map(_harmless, (environment.name, *table(environment.rows), *environment.notes))))
     if flags.out is not None:
         write_page(flags.out, contents(environments, left_out))
         print(f"page with curves, settings and more: {flags.out}")

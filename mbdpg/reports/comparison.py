@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mbdpg.interfaces import require
-from mbdpg.reports.record import Curve, Record, setting, text
+from mbdpg.reports.record import Curve, Record, setting, shared_steps, text
 from mbdpg.reports.statistics import Summary, probability_of_improvement, summarize
 
 LOOKS_ON = {"steps", "evaluate_every", "evaluation_episodes", "log_every", "checkpoint_every"}
@@ -26,6 +26,15 @@ class Row(NamedTuple):
     summary: Summary
     beaten: float | None
     """How often a run of the group with the highest mean is better than one of these; None for that group."""
+
+
+class Comparison(NamedTuple):
+    """Groups at one step."""
+
+    rows: list[Row]
+    """Of each group that has a run there."""
+    notes: list[str]
+    """What is missing in them, and why."""
 
 
 def run_folders(paths: Sequence[Path]) -> list[Path]:
@@ -75,27 +84,56 @@ def _labelled(groups: Mapping[_Settings, list[Record]]) -> dict[str, list[Record
     return dict(labels)
 
 
-def compare(curves: Mapping[str, Sequence[Curve]], *, at: int | None = None) -> list[Row]:
-    """What each group reached at a step; no row if there is no step at which all runs were evaluated.
-
-    Args:
-        curves: of the runs, by the label of their group.
-        at: environment steps at which they are compared; by default the last at which all runs were evaluated.
+def check_step(runs: Sequence[Record], at: int | None) -> None:
+    """Look that something can be compared there.
 
     Raises:
-        UserError: not all runs were evaluated at that step, but all were at others.
+        UserError: no run was evaluated at that step.
     """
-    shared = set.intersection(*(set(curve) for own in curves.values() for curve in own))
-    if not shared:
+    steps = sorted({step for run in runs for step in run.curve})
+    require(at is None or at in steps, f"--at is {at}, expected a step at which a run was evaluated: {_some(steps)}")
+
+
+def compare(groups: Mapping[str, Sequence[Record]], *, at: int | None = None) -> Comparison:
+    """What each group reached at a step.
+
+    Args:
+        groups: of runs that have a curve, by label.
+        at: environment steps at which they are compared, without those that have no evaluation there; by default the
+            last at which all have one.
+    """
+    curves = {label: [run.curve for run in own] for label, own in groups.items()}
+    every = {run.name: curve for label, own in groups.items() for run, curve in zip(own, curves[label], strict=True)}
+    if at is None:
+        shared = shared_steps(every.values())
+        if not shared:
+            return Comparison([], [NO_COMMON_STEP])
+        step, notes = shared[-1], _held_back(every, shared[-1])
+    else:
+        step, notes = at, _without(every, at)
+    points = {label: [(step, curve[step]) for curve in own if step in curve] for label, own in curves.items()}
+    return Comparison(_rows({label: own for label, own in points.items() if own}), notes)
+
+
+def _held_back(curves: Mapping[str, Curve], step: int) -> list[str]:
+    """Which runs end at the step that all share, if that is less than half of what another has."""
+    furthest = max(max(curve) for curve in curves.values())
+    if furthest <= 2 * step:
         return []
-    step = max(shared) if at is None else at
-    require(step in shared, f"--at is {step}, expected a step at which all were evaluated: {_some(sorted(shared))}")
-    return _rows({label: [(step, curve[step]) for curve in own] for label, own in curves.items()})
+    short = [name for name, curve in curves.items() if max(curve) == step]
+    why = f"no more have {', '.join(short)}" if short else "evaluations are at different steps"
+    return [f"compared at {step:,} of {furthest:,} steps: {why}; with --at STEPS runs that lack it are left out"]
 
 
-def compare_last(curves: Mapping[str, Sequence[Curve]]) -> list[Row]:
+def _without(curves: Mapping[str, Curve], step: int) -> list[str]:
+    """Which runs have no evaluation at the step."""
+    missing = [f"{name} (last at {max(curve):,})" for name, curve in curves.items() if step not in curve]
+    return [f"not evaluated at {step:,} steps, so not compared: {', '.join(missing)}"] if missing else []
+
+
+def compare_last(groups: Mapping[str, Sequence[Record]]) -> list[Row]:
     """What each group reached at the last evaluation of each of its runs, which all have one."""
-    return _rows({label: [max(curve.items()) for curve in own] for label, own in curves.items()})
+    return _rows({label: [max(run.curve.items()) for run in own] for label, own in groups.items()})
 
 
 def _rows(points: Mapping[str, Sequence[tuple[int, float]]]) -> list[Row]:
@@ -112,12 +150,9 @@ def _rows(points: Mapping[str, Sequence[tuple[int, float]]]) -> list[Row]:
 
 
 def table(rows: Sequence[Row]) -> list[str]:
-    """Lines that say what each group reached at a step.
-
-    Raises:
-        UserError: there is no row.
-    """
-    require(bool(rows), NO_COMMON_STEP)
+    """Lines that say what each group reached at a step; none without a row."""
+    if not rows:
+        return []
     several = any(row.summary.seeds > 1 for row in rows)
     names = "mean ± std, interquartile mean [95 % interval]" if several else "of one run"
     names += f", and how often {best_of(rows)} is better" if len(rows) > 1 else ""

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mbdpg.reports.comparison import NO_COMMON_STEP, Row, compare, compare_last, grouped
+from mbdpg.reports.comparison import Row, check_step, compare, compare_last, grouped
 from mbdpg.reports.diagnostics import RETURN, diagnostics, series_of
 from mbdpg.reports.differences import differences, machine
 from mbdpg.reports.record import Record, number
@@ -31,6 +31,8 @@ class Environment(NamedTuple):
     groups: Groups
     rows: list[Row]
     """What the groups reached at the same step; empty if there is none."""
+    notes: list[str]
+    """What is missing in the rows, and why."""
 
 
 def compared(runs: Sequence[Record], *, at: int | None) -> list[Environment]:
@@ -41,13 +43,10 @@ def compared(runs: Sequence[Record], *, at: int | None) -> list[Environment]:
         at: environment steps, as for `compare`.
 
     Raises:
-        UserError: `at` is no step at which all were evaluated.
+        UserError: `at` is no step at which any was evaluated.
     """
-    environments = []
-    for env, groups in grouped(runs).items():
-        curves = {label: [run.curve for run in own] for label, own in groups.items()}
-        environments.append(Environment(env, groups, compare(curves, at=at)))
-    return environments
+    check_step(runs, at)
+    return [Environment(env, groups, *compare(groups, at=at)) for env, groups in grouped(runs).items()]
 
 
 def contents(environments: Sequence[Environment], left_out: Sequence[str] = ()) -> Content:
@@ -86,7 +85,6 @@ def _environment(environment: Environment) -> Content:
     groups, rows = environment.groups, environment.rows
     series = {run.name: series_of(run) for runs in groups.values() for run in runs}
     charts = [RETURN, *diagnostics(name for own in series.values() for name in own)]
-    last = compare_last({label: [run.curve for run in runs] for label, runs in groups.items()})
     step = rows[0].steps[1] if rows else None
     return {
         "name": environment.name,
@@ -94,8 +92,8 @@ def _environment(environment: Environment) -> Content:
             {"label": label, "runs": [_run(run, series[run.name]) for run in runs]} for label, runs in groups.items()
         ],
         "charts": [chart._asdict() | {"lines": [line._asdict() for line in chart.lines]} for chart in charts],
-        "note": None if rows else f"No comparison at one step: {NO_COMMON_STEP}.",
-        "scores": _scores(rows, last),
+        "notes": environment.notes,
+        "scores": _scores(rows, compare_last(groups)),
         "clock": _clock(groups, step),
         "problems": _table(
             "Did not go as planned",

@@ -88,7 +88,7 @@ function section(environment) {
     element("h2", {}, environment.name),
     element("div", { class: "controls" }, axisSwitch(environment, state, draw), smoothingSlider(state, draw)),
     legend(environment, state, draw), main, axisTitle,
-    ...(environment.note ? [element("p", { class: "note" }, environment.note)] : []),
+    ...environment.notes.map((note) => element("p", { class: "note" }, note)),
     ...environment.scores.flatMap((scores) => titled(scores, environment.groups)),
     ...titled(environment.problems, environment.groups), ...titled(environment.clock, environment.groups),
     ...(small.length ? [element("h3", {}, "Model and critics, on evaluation episodes"), element("div", { class: "small" }, ...small)] : []),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -123,6 +123,12 @@ def learning_curve(folder: Path) -> Curve:
         UserError: it has no rows yet, or a damaged one.
     """
     return _curve(read_metrics(folder, "eval"))
+
+
+def shared_steps(curves: Iterable[Mapping[int, Any]]) -> list[int]:
+    """Environment steps that all have, in order."""
+    steps = [set(curve) for curve in curves]
+    return sorted(set.intersection(*steps)) if steps else []
 
 
 def numbers(columns: Mapping[str, list[Any]], name: str) -> list[float | None]:

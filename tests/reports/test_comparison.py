@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from mbdpg.interfaces import UserError
-from mbdpg.reports.comparison import compare, compare_last, grouped, run_folders, table
-from mbdpg.reports.record import Curve, learning_curve, read_records
+from mbdpg.reports.comparison import check_step, compare, compare_last, grouped, run_folders, table
+from mbdpg.reports.record import Record, read_records
 
 Make = Callable[..., Path]
 
@@ -59,33 +59,67 @@ def test_no_run_is_lost_where_two_labels_are_one(tmp_path: Path, make: Make) -> 
     assert sorted(run.name for own in groups.values() for run in own) == ["a", "b", "c", "d"]
 
 
-def curves(groups: dict[str, list[Path]]) -> dict[str, list[Curve]]:
-    return {label: [learning_curve(run) for run in runs] for label, runs in groups.items()}
+def records(root: Path) -> dict[str, list[Record]]:
+    """All runs in a folder, by the first letter of their name."""
+    found: dict[str, list[Record]] = {}
+    for run in read_records(run_folders([root]), leave_out=pytest.fail):
+        found.setdefault(run.name[0], []).append(run)
+    return found
 
 
 def test_the_table_is_of_the_last_step_that_all_share(tmp_path: Path, make: Make) -> None:
-    good = [make(tmp_path / f"good-{i}", {0: 0.0, 50: 10.0 + i, 100: 20.0 + i, 150: 99.0}) for i in range(2)]
-    bad = [make(tmp_path / "bad", {0: 0.0, 50: 10.5, 100: 20.5})]
-    both = curves({"good": good, "bad": bad})
-    lines = table(compare(both))
-    assert lines[0].startswith("return at 100 steps: ") and lines[0].endswith("how often good is better")
-    assert lines[1] == "  good (2 runs): 20.5 ± 0.7, 20.5 [20.0, 21.0]"
-    assert lines[2] == "  bad (1 run): 20.5, 50%"
-    single = table(compare(curves({"bad": bad})))
-    assert single == ["return at 100 steps: of one run", "  bad (1 run): 20.5"]
-    assert table(compare(both, at=50))[1].startswith("  good (2 runs): 10.5")
-    with pytest.raises(UserError, match="--at is 150, expected a step at which all were evaluated: 0, 50, 100"):
-        compare(both, at=150)
+    for i in range(2):
+        make(tmp_path / f"a{i}", {0: 0.0, 50: 10.0 + i, 100: 20.0 + i, 150: 99.0})
+    make(tmp_path / "b", {0: 0.0, 50: 10.5, 100: 20.5})
+    both = records(tmp_path)
+    rows, notes = compare(both)
+    lines = table(rows)
+    assert lines[0].startswith("return at 100 steps: ") and lines[0].endswith("how often a is better")
+    assert lines[1] == "  a (2 runs): 20.5 ± 0.7, 20.5 [20.0, 21.0]"
+    assert lines[2] == "  b (1 run): 20.5, 50%" and notes == []
+    single = table(compare({"b": both["b"]}).rows)
+    assert single == ["return at 100 steps: of one run", "  b (1 run): 20.5"]
+    assert table(compare(both, at=50).rows)[1].startswith("  a (2 runs): 10.5")
+
+
+def test_a_run_too_short_for_at_costs_the_others_nothing(tmp_path: Path, make: Make) -> None:
+    """One of them, in whatever environment, refused the whole report."""
+    for name, last in (("a0", 100), ("a1", 50), ("b", 50)):
+        make(tmp_path / name, {0: 0.0, last: 1.0})
+    groups = records(tmp_path)
+    rows, notes = compare(groups, at=100)
+    assert [(row.label, row.summary.seeds) for row in rows] == [("a", 1)]
+    assert notes == ["not evaluated at 100 steps, so not compared: a1 (last at 50), b (last at 50)"]
+    assert compare({"b": groups["b"]}, at=100) == ([], ["not evaluated at 100 steps, so not compared: b (last at 50)"])
+    runs = [run for own in groups.values() for run in own]
+    check_step(runs, 100)
+    with pytest.raises(UserError, match="--at is 30, expected a step at which a run was evaluated: 0, 50, 100"):
+        check_step(runs, 30)
+
+
+def test_a_run_that_has_just_begun_is_named_where_it_pulls_the_comparison_down(tmp_path: Path, make: Make) -> None:
+    make(tmp_path / "a", dict.fromkeys((0, 100, 1000), 1.0))
+    make(tmp_path / "b", dict.fromkeys((0, 100), 1.0))
+    make(tmp_path / "c", dict.fromkeys((0, 100, 200), 1.0))
+    groups = records(tmp_path)
+    (note,) = compare(groups).notes
+    assert note.startswith("compared at 100 of 1,000 steps: no more have b; with --at STEPS ")
+    assert compare({name: groups[name] for name in "bc"}).notes == []  # half of it is far enough
+    make(tmp_path / "d", dict.fromkeys((0, 150, 300), 1.0))
+    groups = records(tmp_path)
+    (note,) = compare({name: groups[name] for name in "ad"}).notes
+    assert note.startswith("compared at 0 of 1,000 steps: evaluations are at different steps")
 
 
 def test_the_last_evaluations_may_be_at_different_steps(tmp_path: Path, make: Make) -> None:
-    runs = [make(tmp_path / "a", {0: 0.0, 50: 4.0}), make(tmp_path / "b", {0: 0.0, 100: 6.0, 150: None})]
-    (row,) = compare_last(curves({"td3": runs}))
-    assert row[:2] == ("td3", (50, 100)) and row.summary.mean == 5.0 and row.beaten is None
+    make(tmp_path / "a0", {0: 0.0, 50: 4.0})
+    make(tmp_path / "a1", {0: 0.0, 100: 6.0, 150: None})
+    (row,) = compare_last(records(tmp_path))
+    assert row[:2] == ("a", (50, 100)) and row.summary.mean == 5.0 and row.beaten is None
 
 
-def test_runs_without_a_common_step_are_refused(tmp_path: Path, make: Make) -> None:
-    runs = {"a": [make(tmp_path / "a", {0: 1.0})], "b": [make(tmp_path / "b", {0: None, 5: 1.0})]}
-    assert compare(curves(runs)) == compare(curves(runs), at=0) == []
-    with pytest.raises(UserError, match="no evaluation at the same step"):
-        table([])
+def test_runs_without_a_common_step_are_not_compared(tmp_path: Path, make: Make) -> None:
+    make(tmp_path / "a", {0: 1.0})
+    make(tmp_path / "b", {0: None, 5: 1.0})
+    rows, (note,) = compare(records(tmp_path))
+    assert table(rows) == [] and "no evaluation at the same step" in note

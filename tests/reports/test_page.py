@@ -84,7 +84,7 @@ def test_without_a_common_step_a_note_says_so_and_the_last_evaluations_remain(tm
     make(tmp_path / "b", {5: 2.0})
     content = content_of(tmp_path)
     (own,) = content["environments"]
-    assert "no evaluation at the same step" in own["note"]
+    assert "no evaluation at the same step" in own["notes"][0]
     assert next(iter(tables_of(content))) == "Return at the last evaluation of each run"
     assert own["scores"][0]["rows"] == [["td3", "0 – 5", "2", "1.5", "0.7", "1.5", "1.0 to 2.0"]]
 
