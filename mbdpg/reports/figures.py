@@ -33,8 +33,8 @@ class Evaluation(NamedTuple):
     env_steps: int
     expert_env_steps: int
     return_mean: float
-    hours: float
-    """Of wall-clock time so far, in every process that worked on the run."""
+    hours: float | None
+    """Of wall-clock time so far, in every process that worked on the run; None where its timings are missing."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Errors:
 def evaluations(run: Record) -> list[Evaluation]:
     """A run's evaluations but those in which every episode failed."""
     hours, experts = run.hours(), dict(zip(run.steps, run.column("expert_env_steps"), strict=True))
-    return [Evaluation(step, int(experts[step] or 0), mean, hours.get(step, 0.0)) for step, mean in run.curve.items()]
+    return [Evaluation(step, int(experts[step] or 0), mean, hours.get(step)) for step, mean in run.curve.items()]
 
 
 def write_figure(name: str, panels: Sequence[Curves | Errors], out: Path, *, as_hours: bool = False) -> list[str]:
@@ -125,10 +125,21 @@ def _hours(groups: Mapping[str, list[list[Evaluation]]]) -> list[str]:
     shared = _shared([run for runs in groups.values() for run in runs])
     if not shared:
         return ["  no step that all runs were evaluated at yet"]
-    hours = {label: float(np.mean([_at(run, shared[-1]).hours for run in runs])) for label, runs in groups.items()}
+    hours = {label: _mean([_at(run, shared[-1]).hours for run in runs]) for label, runs in groups.items()}
     unit = hours.get("td3")
-    times = {label: f" ({found / unit:.1f} times td3's)" if unit else "" for label, found in hours.items()}
-    return [f"  {label}: {found:.2f} hours for {shared[-1]:,} steps{times[label]}" for label, found in hours.items()]
+    lines = []
+    for label, found in hours.items():
+        times = f" ({found / unit:.1f} times td3's)" if unit and found is not None else ""
+        lines.append(
+            f"  {label}: " + ("no timings" if found is None else f"{found:.2f} hours for {shared[-1]:,} steps{times}")
+        )
+    return lines
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    """Of those that are there."""
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None
 
 
 def _seeds(runs: Sized) -> str:

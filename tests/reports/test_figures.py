@@ -19,7 +19,7 @@ def make(path: Path, returns: dict[int, float | None], *, seconds: tuple[float, 
     RunFolder.create(path, {"env": "E-v0", "algorithm": "td3", "agent": {}, "seed": 0})
     log = MetricsLog(path)
     for i, (step, value) in enumerate(returns.items()):
-        row = {"expert_env_steps": expert, "time/seconds": seconds[i] if seconds else 0.0}
+        row: dict[str, float] = {"expert_env_steps": expert} | ({"time/seconds": seconds[i]} if seconds else {})
         log.write("eval", step, row if value is None else row | {"eval/return_mean": value})
     log.close()
     return Record.read(path, root=path.parent)
@@ -57,7 +57,7 @@ def test_a_figure_has_its_numbers_beside_it(tmp_path: Path) -> None:
     assert len(rows) == 2 * 200 + 2 * 3 + 2
     assert rows[-1] == {
         **{"panel": "E-v0", "label": "sac", "seed": "0", "env_steps": "10", "expert_env_steps": "40"},
-        **{"return_mean": "1.0", "hours": "0.0", "depth": "", "rmse": "", "persistence": ""},
+        **{"return_mean": "1.0", "hours": "", "depth": "", "rmse": "", "persistence": ""},
     }
     assert (tmp_path / "figure-x.png").read_bytes().startswith(b"\x89PNG")
 
@@ -74,6 +74,16 @@ def test_a_table_of_hours_is_in_multiples_of_td3(tmp_path: Path) -> None:
         "  mbdpg: 1.50 hours for 10 steps (2.0 times td3's)",
     ]
     assert not (tmp_path / "table-x.png").exists()
+
+
+def test_missing_timings_are_not_taken_for_no_time(tmp_path: Path) -> None:
+    """They counted as 0 hours, in the file and in the mean."""
+    timed = make(tmp_path / "a", {0: 0.0, 10: 1.0}, seconds=(0.0, 7200.0))
+    runs = {"td3": [timed, make(tmp_path / "b", {0: 0.0, 10: 1.0})], "sac": [make(tmp_path / "c", {0: 0.0, 10: 1.0})]}
+    lines = write_figure("table-x", [Curves("E-v0", runs)], tmp_path, as_hours=True)
+    assert lines[2:] == ["  td3: 2.00 hours for 10 steps (1.0 times td3's)", "  sac: no timings"]
+    with open(tmp_path / "table-x.csv", newline="") as file:
+        assert [row["hours"] for row in csv.DictReader(file)] == ["0.0", "2.0", "", "", "", ""]
 
 
 def test_runs_without_a_common_step_are_left_out_of_the_picture(tmp_path: Path) -> None:
