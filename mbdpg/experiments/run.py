@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
-import subprocess
 import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
@@ -15,6 +14,7 @@ from typing import Any, NamedTuple
 from mbdpg.agents import mbdpg, mbpo, pets, sac, td3
 from mbdpg.dynamics.planning import PlanningPolicy, is_planner, planner_of
 from mbdpg.experiments.config import RunConfig
+from mbdpg.experiments.origin import origin
 from mbdpg.experiments.recorder import Recorder
 from mbdpg.imitation.demonstrations import Demonstrations
 from mbdpg.interfaces import Agent, Environment, EnvSpec, UserError, require
@@ -62,7 +62,7 @@ def train(
     make = make_env or config.make_env
     spec = _spec_of(make)
     demonstrations = Demonstrations.load(Path(config.demonstrations), spec) if config.demonstrations else None
-    description = config.to_json() | {"commit": _commit(), "machine": describe_machine()}
+    description = config.to_json() | origin()
     folders: list[RunFolder] = []
     with contextlib.ExitStack() as undo, contextlib.ExitStack() as stack:
         for seed in seeds:
@@ -303,14 +303,3 @@ def _seed_of(folder: RunFolder) -> int:
     fits = isinstance(seed, int) and 0 <= seed < 2**31
     require(fits, f"{folder.path} has seed {seed!r} in its config.json, expected a number from 0 to 2^31 - 1")
     return int(seed)  # type: ignore[arg-type]  # checked above
-
-
-def _commit() -> str | None:
-    """The commit of the checkout this package runs from, with a + if it has changes; None elsewhere."""
-    git = ["git", "-C", str(Path(__file__).parent)]
-    try:
-        commit = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5)
-        changes = subprocess.run([*git, "status", "--porcelain", "-uno"], capture_output=True, text=True, timeout=5)
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return commit.stdout.strip() + ("+" if changes.stdout.strip() else "") if commit.returncode == 0 else None

@@ -12,11 +12,16 @@ from typing import Any, final
 from mbdpg.experiments import expert
 from mbdpg.experiments.compilations import keep_compilations
 from mbdpg.experiments.config import RunConfig
+from mbdpg.experiments.origin import origin
 from mbdpg.experiments.run import OnUpdate, resume, train
 from mbdpg.interfaces import UserError, require
-from mbdpg.storage.files import replace_durably
+from mbdpg.reports.record import setting
+from mbdpg.storage.files import DamagedFileError, parse_object, read_checked, replace_durably
 from mbdpg.storage.metrics import read_metrics
 from mbdpg.storage.run_folder import RunFolder, discard_unbegun
+
+ORIGIN = "origin"
+"""In a note, what does not count as a setting: another commit may go on with what one began."""
 
 
 @final
@@ -127,16 +132,21 @@ def made_as(file: Path, settings: Mapping[str, Any]) -> bool:
     """
     if not file.exists():
         return False
-    note = _note(file)
-    same = note.is_file() and note.read_text(encoding="utf-8") == _as_text(settings)
+    noted = {name: value for name, value in _noted(file).items() if name != ORIGIN}
+    same = _as_text(noted) == _as_text(settings)
     require(same, f"{file} was made with other settings; move it away, or choose another --out")
     return True
 
 
 def say_made_as(file: Path, settings: Mapping[str, Any]) -> None:
-    """Write the note that `made_as` reads, before the file itself."""
+    """Write the note that `made_as` and `origin_of` read, before the file itself."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    replace_durably(_note(file), _as_text(settings).encode())
+    replace_durably(_note(file), _as_text({**settings, ORIGIN: origin()}).encode())
+
+
+def origin_of(file: Path) -> dict[str, Any]:
+    """The commit and the machine that made a file, as the note beside it says; empty where it does not."""
+    return setting(_noted(file), ORIGIN)
 
 
 def steps_evaluated(run: Path) -> int:
@@ -153,6 +163,13 @@ def steps_evaluated(run: Path) -> int:
 
 def _note(file: Path) -> Path:
     return file.with_name(f"{file.name}.settings.json")
+
+
+def _noted(file: Path) -> dict[str, Any]:
+    try:
+        return parse_object(read_checked(_note(file), limit=1 << 20), _note(file))
+    except DamagedFileError:
+        return {}
 
 
 def _as_text(settings: Mapping[str, Any]) -> str:

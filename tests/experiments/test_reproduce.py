@@ -17,7 +17,7 @@ from mbdpg.experiments.launch import Local, Work
 from mbdpg.experiments.reproduce import reproduce
 from mbdpg.experiments.run import train
 from mbdpg.experiments.studies import SCALES, Cell, Panel, Study
-from mbdpg.experiments.work import Training, made_as, say_made_as
+from mbdpg.experiments.work import Training, made_as, origin_of, say_made_as
 from mbdpg.interfaces import UserError
 from mbdpg.storage.run_folder import RunFolder, only_writer
 from mbdpg.training.loop import Schedule
@@ -173,5 +173,15 @@ def test_demonstrations_and_errors_of_another_scale_are_refused(tmp_path: Path) 
     assert not made_as(file, {"updates": 20})
     file.write_text("depth")
     assert made_as(file, {"updates": 20})
+    assert origin_of(file).keys() == {"commit", "machine"}
     with pytest.raises(UserError, match="seed-0.csv was made with other settings; move it away"):
         made_as(file, {"updates": 3000})
+    note = tmp_path / "seed-0.csv.settings.json"
+    note.write_text('{"updates": 20}')  # of before origins were noted
+    assert made_as(file, {"updates": 20}) and origin_of(file) == {}
+    note.write_text('{"updates": 20, "origin": {"commit": "another"}}')
+    assert made_as(file, {"updates": 20}) and origin_of(file) == {"commit": "another"}
+    for damaged in ("{", "[]", ""):
+        note.write_text(damaged)
+        with pytest.raises(UserError, match="seed-0.csv was made with other settings"):
+            made_as(file, {"updates": 20})
