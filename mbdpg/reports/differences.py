@@ -34,6 +34,12 @@ def differences(groups: Mapping[str, Sequence[Record]]) -> list[Difference]:
     return found
 
 
+def commit(config: Mapping[str, Any]) -> str:
+    """The commit of a run in ten digits, with a + if its checkout had changes; a dash where there is none."""
+    whole = text(config.get("commit"))
+    return whole[:10] + "+" * (whole.endswith("+") and len(whole) > 10)
+
+
 def machine(config: Mapping[str, Any]) -> str:
     """The machine of a run in a few words."""
     parts = setting(config, "machine")
@@ -45,15 +51,14 @@ def _flat(config: Mapping[str, Any]) -> dict[str, str]:
     """Settings by name, as text; those of the run and of the agent come first."""
     machine = setting(config, "machine")
     groups = {
-        "": {name: config.get(name) for name in ("algorithm", "demonstrations", "commit")},
+        "": {name: config.get(name) for name in ("algorithm", "demonstrations")} | {"commit": commit(config)},
         "agent ": setting(config, "agent"),
         "schedule ": setting(config, "schedule"),
         "env ": setting(config, "env_options"),
         "machine ": {name: value for name, value in machine.items() if name != "versions"},
         "version ": setting(machine, "versions"),
     }
-    flat = {f"{group}{name}": text(value) for group, values in groups.items() for name, value in values.items()}
-    return flat | {"commit": flat["commit"][:10]}
+    return {f"{group}{name}": text(value) for group, values in groups.items() for name, value in values.items()}
 
 
 def _cell(values: Sequence[tuple[str, str]]) -> str:

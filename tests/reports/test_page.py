@@ -139,6 +139,14 @@ def test_settings_that_differ_are_listed_by_group_and_run(tmp_path: Path, make: 
     assert tables["Settings that only some algorithms have"] == [["agent temperature", "", "2"]]
 
 
+def test_a_commit_with_changes_is_not_taken_for_the_one_without(tmp_path: Path, make: Make) -> None:
+    """The + behind it was cut off, and the runs seemed to be of the same code."""
+    make(tmp_path / "a", {0: 1.0}, config={"commit": "0" * 40})
+    make(tmp_path / "b", {0: 1.0}, config={"commit": "0" * 40 + "+"})
+    tables = tables_of(content_of(tmp_path))
+    assert tables["Settings that differ"] == [["commit", "0000000000 (a); 0000000000+ (b)"]]
+
+
 def test_problems_name_their_run(tmp_path: Path, make: Make) -> None:
     run = make(tmp_path / "runs" / "a", {0: 1.0}, config={"schedule": {"steps": 10}})
     assert tables_of(content_of(run))["Did not go as planned"] == [["td3", "a", "reached 0 of 10 planned steps"]]
