@@ -12,9 +12,10 @@ from mbdpg.experiments.config import RunConfig
 from mbdpg.experiments.launch import Local, Ray, Work, launch
 from mbdpg.experiments.model_study import ModelFit, is_whole
 from mbdpg.experiments.studies import RECORDED, SCALES, Cell, Model, Scale, ScaleName, Study, StudyName, study
-from mbdpg.experiments.work import Demonstrating, Training
+from mbdpg.experiments.work import Demonstrating, Training, origin_of
 from mbdpg.interfaces import require
-from mbdpg.reports.figures import Curves, Errors, write_figure
+from mbdpg.reports.figures import write_figure
+from mbdpg.reports.panels import Curves, Errors
 from mbdpg.reports.record import Record
 from mbdpg.storage.run_folder import only_writer
 
@@ -41,7 +42,8 @@ def reproduce(
         should_stop: asked often.
 
     Raises:
-        UserError: a run that is there already has other settings, or nothing of the study could be done.
+        UserError: something could not be done, for example because a run there has other settings; the figure is then
+            drawn without it.
     """
     scale = SCALES[scale_name]
     scale = dataclasses.replace(scale, seeds=tuple(seeds)) if seeds else scale
@@ -50,7 +52,8 @@ def reproduce(
     together = isinstance(engine, Ray) and engine.gpus
     groups = [scale.seeds] if together else [(seed,) for seed in scale.seeds]
     first, then = _works(chosen, scale, groups, out)
-    say(f"{name}: the paper says: {chosen.claim}")
+    claim = f"The paper says: {chosen.claim}"
+    say(f"{name}: {claim}")
     failures: dict[str, str] = {}
     with only_writer(out):
         for works in (first, then):
@@ -59,7 +62,7 @@ def reproduce(
             failures |= launch(works, engine, logs=out / "logs", say=say, should_stop=should_stop)
             if should_stop():
                 return
-        _draw(chosen, scale, out, say)
+        _draw(chosen, scale, out, [f"`{_command(name, scale_name, seeds, engine)}`", claim], say)
     logs, count = out / "logs", len(first) + len(then)
     require(not failures, f"{len(failures)} of {count} failed (see {logs}); the figure lacks them")
 
@@ -114,19 +117,27 @@ def _errors_file(model: Model, seed: int, out: Path) -> Path:
     return out / "models" / model.label.replace(" ", "-") / f"seed-{seed}.csv"
 
 
-def _draw(chosen: Study, scale: Scale, out: Path, say: Callable[[str], None]) -> None:
-    """The study's figure, and its numbers as CSV, from whatever is there."""
+def _command(name: StudyName, scale_name: ScaleName, seeds: Sequence[int], engine: Local | Ray) -> str:
+    """What makes the same from nothing, wherever it lies."""
+    words = ["mbdpg reproduce", name, "--scale", scale_name, *(["--seeds", *map(str, seeds)] if seeds else [])]
+    if isinstance(engine, Ray):
+        words += ["--engine ray", *(["--gpus"] * engine.gpus)]
+    return " ".join(words)
+
+
+def _draw(chosen: Study, scale: Scale, out: Path, heading: Sequence[str], say: Callable[[str], None]) -> None:
+    """The study's figure, its numbers as CSV and its tables, from whatever is there."""
     panels: list[Curves | Errors] = []
     for panel in chosen.panels:
         if panel.models:
-            files = {
-                model.label: [file for seed in scale.seeds if is_whole(file := _errors_file(model, seed, out))]
-                for model in panel.models
-            }
+            files = {}
+            for model in panel.models:
+                whole = [file for seed in scale.seeds if is_whole(file := _errors_file(model, seed, out))]
+                files[model.label] = {file: origin_of(file) for file in whole}
             panels.append(Errors(panel.title, {label: found for label, found in files.items() if found}))
         else:
             begun = {cell.label: _training(cell, scale.seeds, scale, out).begun() for cell in panel.cells}
             runs = {label: [Record.read(run, root=out) for run in found] for label, found in begun.items()}
             panels.append(Curves(panel.title, {label: found for label, found in runs.items() if found}))
-    for line in write_figure(chosen.name, panels, out, as_hours=chosen.as_hours):
+    for line in write_figure(chosen.name, panels, out, heading=heading, as_hours=chosen.as_hours):
         say(line)

@@ -167,6 +167,14 @@ def table(rows: Sequence[Row]) -> list[str]:
     return lines
 
 
+def cells(found: Summary) -> list[str]:
+    """Mean, deviation, interquartile mean and its interval, as text; of a single run only the mean is known."""
+    if found.seeds < 2:
+        return [f"{found.mean:,.1f}", "", "", ""]
+    rest = f"{found.interquartile_mean:,.1f}", f"{found.low:,.1f} to {found.high:,.1f}"
+    return [f"{found.mean:,.1f}", f"{found.std:,.1f}", *rest]
+
+
 def best_of(rows: Sequence[Row]) -> str:
     """Label of the group with the highest mean."""
     return next(row.label for row in rows if row.beaten is None)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mbdpg.reports.comparison import Row, check_step, compare, compare_last, grouped
+from mbdpg.reports.comparison import Row, cells, check_step, compare, compare_last, grouped
 from mbdpg.reports.diagnostics import RETURN, diagnostics, series_of
 from mbdpg.reports.differences import differences, machine
 from mbdpg.reports.record import Record, number
@@ -141,11 +141,8 @@ def _score_table(title: str, rows: Sequence[Row], *, steps: bool = False) -> Con
     lines = []
     for row in rows:
         low, high = row.steps
-        found, several = row.summary, row.summary.seeds > 1
         line = [row.label, *([f"{low:,}" if low == high else f"{low:,} – {high:,}"] * steps)]
-        line += [str(found.seeds), f"{found.mean:,.1f}"]
-        line += [f"{found.std:,.1f}", f"{found.interquartile_mean:,.1f}"] if several else ["", ""]
-        line += [f"{found.low:,.1f} to {found.high:,.1f}" if several else ""]
+        line += [str(row.summary.seeds), *cells(row.summary)]
         line += ["" if row.beaten is None else f"{row.beaten:.0%}"] * (len(rows) > 1)
         lines.append(line)
     return _table(title, header, lines, numeric=range(1, len(header)))

@@ -43,6 +43,8 @@ def commit(config: Mapping[str, Any]) -> str:
 def machine(config: Mapping[str, Any]) -> str:
     """The machine of a run in a few words."""
     parts = setting(config, "machine")
+    if not parts:
+        return "a machine that is not noted"
     cores, system = parts.get("cores"), text(parts.get("platform")).partition("-")[0]
     return f"{text(parts.get('cpu'))}, {text(cores)} core{'s' * (cores != 1)}, {system}"
 

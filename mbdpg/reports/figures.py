@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping, Sequence, Sized
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence, Sized
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -14,8 +13,10 @@ import numpy as np
 matplotlib.use("Agg")  # no display is ever needed
 from matplotlib import pyplot as plt
 
-from mbdpg.reports.record import Record
+from mbdpg.reports.panels import Curves, Errors, Panels
+from mbdpg.reports.record import shared_steps
 from mbdpg.reports.statistics import summarize
+from mbdpg.reports.tables import Groups, tables
 from mbdpg.storage.files import replace_durably, replace_table
 
 COLUMNS: tuple[Any, ...] = (
@@ -23,138 +24,54 @@ COLUMNS: tuple[Any, ...] = (
     *("depth", "rmse", "persistence"),
 )
 
-DEPTHS = (1, 10, 50, 200)
-"""Imagined steps whose error is printed."""
 
+def write_figure(
+    name: str, panels: Panels, out: Path, *, heading: Sequence[str] = (), as_hours: bool = False
+) -> list[str]:
+    """Write `name`.csv and `name`.md into `out`, and `name`.png unless the study is a table of hours.
 
-class Evaluation(NamedTuple):
-    """One evaluation of one run."""
-
-    env_steps: int
-    expert_env_steps: int
-    return_mean: float
-    hours: float | None
-    """Of wall-clock time so far, in every process that worked on the run; None where its timings are missing."""
-
-
-@dataclass(frozen=True)
-class Curves:
-    """Learning curves of a task."""
-
-    title: str
-    runs: Mapping[str, Sequence[Record]]
-    """By label."""
-
-    def evaluations(self) -> dict[str, list[list[Evaluation]]]:
-        """Of every run, by label."""
-        return {label: [evaluations(run) for run in runs] for label, runs in self.runs.items()}
-
-
-@dataclass(frozen=True)
-class Errors:
-    """Open-loop errors of dynamics models."""
-
-    title: str
-    files: Mapping[str, Sequence[Path]]
-    """CSV files with depth, rmse and persistence, one per seed, by label."""
-
-    def tables(self) -> dict[str, np.ndarray]:
-        """Shape (seed, depth, 3) by label."""
-        return {
-            label: np.stack([np.loadtxt(file, delimiter=",", skiprows=1) for file in files])
-            for label, files in self.files.items()
-        }
-
-
-def evaluations(run: Record) -> list[Evaluation]:
-    """A run's evaluations but those in which every episode failed."""
-    hours, experts = run.hours(), dict(zip(run.steps, run.column("expert_env_steps"), strict=True))
-    return [Evaluation(step, int(experts[step] or 0), mean, hours.get(step)) for step, mean in run.curve.items()]
-
-
-def write_figure(name: str, panels: Sequence[Curves | Errors], out: Path, *, as_hours: bool = False) -> list[str]:
-    """Write `name`.csv into `out`, and `name`.png unless the study is a table of hours.
+    Args:
+        name: of the study.
+        panels: what it sets side by side.
+        out: folder.
+        heading: paragraphs above the tables.
+        as_hours: whether the tables are of wall-clock time.
 
     Returns:
-        Lines that say what is in them.
+        Lines that say where they are, and the tables.
     """
-    rows, lines = [COLUMNS], [f"numbers in {out / f'{name}.csv'}"]
-    for panel in panels:
-        if isinstance(panel, Curves):
-            groups = panel.evaluations()
-            for label, runs in groups.items():
-                for record, run in zip(panel.runs[label], runs, strict=True):
-                    seed = record.folder.name.removeprefix("seed-")
-                    rows += [(panel.title, label, seed, *one, *[""] * 3) for one in run]
-            lines += [panel.title, *(_hours(groups) if as_hours else _returns(groups))]
-        else:
-            lines += [f"{panel.title}: error after {', '.join(map(str, DEPTHS))} steps, persistence's last"]
-            for label, table in panel.tables().items():
-                for path, own in zip(panel.files[label], table, strict=True):
-                    seed = path.stem.removeprefix("seed-")
-                    rows += [(panel.title, label, seed, *[""] * 4, int(depth), *both) for depth, *both in own]
-                lines.append(f"  {label} ({_seeds(table)}): {_errors(table)}")
-    replace_table(out / f"{name}.csv", rows)
+    replace_table(out / f"{name}.csv", [COLUMNS, *(row for panel in panels for row in _rows(panel))])
+    text = tables(panels, as_hours=as_hours)
+    page = [f"# {name}", *heading, "\n".join(text)]
+    replace_durably(out / f"{name}.md", ("\n\n".join(page) + "\n").encode())
+    lines = [f"numbers in {out / f'{name}.csv'}", f"tables in {out / f'{name}.md'}"]
     if not as_hours:
         replace_durably(out / f"{name}.png", _picture(panels))
-        lines.insert(1, f"figure in {out / f'{name}.png'}")
-    return lines
+        lines.append(f"figure in {out / f'{name}.png'}")
+    return [*lines, *text]
 
 
-def _errors(table: np.ndarray) -> str:
-    mean, spread = table[:, :, 1].mean(axis=0), table[:, :, 1].std(axis=0, ddof=1 if len(table) > 1 else 0)
-    parts = [f"{mean[depth - 1]:.3f} ± {spread[depth - 1]:.3f}" for depth in DEPTHS if depth <= table.shape[1]]
-    return " / ".join([*parts, f"{table[:, -1, 2].mean():.3f}"])
-
-
-def _returns(groups: Mapping[str, list[list[Evaluation]]]) -> list[str]:
-    """Each group at the last step that all its runs have."""
-    lines = []
-    for label, runs in groups.items():
-        shared = _shared(runs)
-        if shared:
-            found = summarize([_at(run, shared[-1]).return_mean for run in runs])
-            interval = f", interquartile mean [{found.low:,.1f}, {found.high:,.1f}]" if found.seeds > 1 else ""
-            spread = f" ± {found.std:,.1f}" if found.seeds > 1 else ""
-            lines.append(f"  {label} ({_seeds(runs)}) at {shared[-1]:,}: {found.mean:,.1f}{spread}{interval}")
-    return lines
-
-
-def _hours(groups: Mapping[str, list[list[Evaluation]]]) -> list[str]:
-    """Each group's wall-clock time at the last step that all runs of all groups have, and as a multiple of TD3's."""
-    shared = _shared([run for runs in groups.values() for run in runs])
-    if not shared:
-        return ["  no step that all runs were evaluated at yet"]
-    hours = {label: _mean([_at(run, shared[-1]).hours for run in runs]) for label, runs in groups.items()}
-    unit = hours.get("td3")
-    lines = []
-    for label, found in hours.items():
-        times = f" ({found / unit:.1f} times td3's)" if unit and found is not None else ""
-        lines.append(
-            f"  {label}: " + ("no timings" if found is None else f"{found:.2f} hours for {shared[-1]:,} steps{times}")
-        )
-    return lines
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    """Of those that are there."""
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else None
+def _rows(panel: Curves | Errors) -> list[Sequence[Any]]:
+    """Of the CSV file."""
+    rows: list[Sequence[Any]] = []
+    if isinstance(panel, Curves):
+        for label, runs in panel.evaluations().items():
+            for record, run in zip(panel.runs[label], runs, strict=True):
+                seed = record.folder.name.removeprefix("seed-")
+                rows += [(panel.title, label, seed, *one, *[""] * 3) for one in run.values()]
+        return rows
+    for label, table in panel.tables().items():
+        for path, own in zip(panel.files[label], table, strict=True):
+            seed = path.stem.removeprefix("seed-")
+            rows += [(panel.title, label, seed, *[""] * 4, int(depth), *both) for depth, *both in own]
+    return rows
 
 
 def _seeds(runs: Sized) -> str:
     return f"{len(runs)} seed{'s' * (len(runs) != 1)}"
 
 
-def _shared(runs: Sequence[Sequence[Evaluation]]) -> list[int]:
-    return sorted(set.intersection(*({one.env_steps for one in run} for run in runs))) if runs else []
-
-
-def _at(run: Sequence[Evaluation], step: int) -> Evaluation:
-    return next(one for one in run if one.env_steps == step)
-
-
-def _picture(panels: Sequence[Curves | Errors]) -> bytes:
+def _picture(panels: Panels) -> bytes:
     """A column per panel. Learning curves have a row as in the paper, one for few seeds, one that counts experts."""
     rows = 3 if any(isinstance(panel, Curves) for panel in panels) else 1
     size = (5.0 * len(panels), 3.4 * rows)
@@ -198,17 +115,17 @@ def _draw_errors(axes: Any, panel: Errors) -> None:
 
 def _draw_curves(
     axes: Any,
-    groups: Mapping[str, list[list[Evaluation]]],
+    groups: Groups,
     band: Callable[[list[float]], tuple[float, float, float]],
     *,
     count_experts: bool = False,
 ) -> None:
     for number, (label, runs) in enumerate(groups.items()):
-        shared = _shared(runs)
+        shared = shared_steps(runs)
         if not shared:
             continue
-        added = max(one.expert_env_steps for run in runs for one in run) if count_experts else 0
-        middle, low, high = np.transpose([band([_at(run, step).return_mean for run in runs]) for step in shared])
+        added = max(one.expert_env_steps for run in runs for one in run.values()) if count_experts else 0
+        middle, low, high = np.transpose([band([run[step].return_mean for run in runs]) for step in shared])
         steps = np.asarray(shared) + added
         axes.plot(steps, middle, color=f"C{number}", label=f"{label} ({_seeds(runs)})")
         axes.fill_between(steps, low, high, color=f"C{number}", alpha=0.2, linewidth=0)

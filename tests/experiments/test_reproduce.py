@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -76,7 +77,12 @@ def test_what_is_finished_is_skipped_and_what_was_begun_goes_on(launched: list[s
     assert launched == [f"Pendulum-v1 {label} seed {seed}" for label in ("td3", "td3-width=5") for seed in (0, 1)]
     assert (begun / "metrics.jsonl").read_bytes().startswith(first_rows)
     assert "figure-8: 4 of 4 to do" in said and (tmp_path / "figure-8.png").stat().st_size > 1000
-    assert any(line.startswith("  td3 width=5 (2 seeds) at 40: ") for line in said)
+    assert any(re.match(r"\| td3 width=5 +\| 2 +\| 40 +\| -", line) for line in said)
+    text = (tmp_path / "figure-8.md").read_text()
+    assert text.startswith(
+        "# figure-8\n\n`mbdpg reproduce figure-8 --scale quick --seeds 0 1`\n\nThe paper says: nothing"
+    )
+    assert "- 4 of 4: commit " in text
     found = {(row["label"], row["seed"], row["env_steps"]) for row in numbers(tmp_path)}
     assert found == {(l, s, n) for l in ("td3", "td3 width=5") for s in "01" for n in ("0", "20", "40")}
     launched.clear()

@@ -1,28 +1,35 @@
-"""A study's figure: numbers as recorded, time over resumes, and panels of both kinds in one picture."""
+"""A study's figure and tables: numbers as recorded, time over resumes, and what made them."""
 
 from __future__ import annotations
 
 import csv
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from mbdpg.reports.figures import Curves, Errors, evaluations, write_figure
+from mbdpg.reports.figures import write_figure
+from mbdpg.reports.panels import Curves, Errors, evaluations
 from mbdpg.reports.record import Record
 from mbdpg.storage.metrics import MetricsLog
 from mbdpg.storage.run_folder import RunFolder
 
+MACHINE = {"cpu": "Fast", "cores": 2, "platform": "Linux-6.1-x86_64"}
+
 
 def make(path: Path, returns: dict[int, float | None], *, seconds: tuple[float, ...] = (), expert: int = 0) -> Record:
     """A run with these evaluations."""
-    RunFolder.create(path, {"env": "E-v0", "algorithm": "td3", "agent": {}, "seed": 0})
+    RunFolder.create(path, {"env": "E-v0", "algorithm": "td3", "commit": "e" * 40, "machine": MACHINE})
     log = MetricsLog(path)
     for i, (step, value) in enumerate(returns.items()):
         row: dict[str, float] = {"expert_env_steps": expert} | ({"time/seconds": seconds[i]} if seconds else {})
         log.write("eval", step, row if value is None else row | {"eval/return_mean": value})
     log.close()
     return Record.read(path, root=path.parent)
+
+
+def rows_in(lines: list[str]) -> list[list[str]]:
+    """The cells of all tables, but for the rules below their heads."""
+    return [[cell.strip() for cell in line[1:-1].split("|")] for line in lines if line.startswith("| ")]
 
 
 def errors(path: Path, scale: float) -> Path:
@@ -35,22 +42,22 @@ def errors(path: Path, scale: float) -> Path:
 def test_hours_go_on_over_resumes_and_failed_evaluations(tmp_path: Path) -> None:
     run = make(tmp_path / "run", {0: 1.0, 10: None, 20: 3.0, 30: 4.0}, seconds=(360.0, 720.0, 180.0, 360.0), expert=7)
     found = evaluations(run)
-    assert [one.env_steps for one in found] == [0, 20, 30] and {one.expert_env_steps for one in found} == {7}
-    assert [one.hours for one in found] == pytest.approx([0.1, 0.25, 0.3])
+    assert list(found) == [0, 20, 30] and {one.expert_env_steps for one in found.values()} == {7}
+    assert [one.hours for one in found.values()] == pytest.approx([0.1, 0.25, 0.3])
 
 
 def test_a_figure_has_its_numbers_beside_it(tmp_path: Path) -> None:
     td3 = [make(tmp_path / "td3" / f"seed-{i}", {0: 0.0, 10: 5.0 + i, 20: 99.0}) for i in range(2)]
     sac = [make(tmp_path / "sac" / "seed-0", {0: 0.0, 10: 1.0}, expert=40)]
     fits = [errors(tmp_path / "models" / f"seed-{i}.csv", 1.0 + i) for i in range(2)]
-    panels = [Errors("models", {"mixture": fits}), Curves("E-v0", {"td3": td3, "sac": sac})]
+    panels = [Errors("models", {"mixture": {file: {} for file in fits}}), Curves("E-v0", {"td3": td3, "sac": sac})]
     lines = write_figure("figure-x", panels, tmp_path)
-    assert lines[2:] == [
-        "models: error after 1, 10, 50, 200 steps, persistence's last",
-        "  mixture (2 seeds): 1.500 ± 0.707 / 15.000 ± 7.071 / 75.000 ± 35.355 / 300.000 ± 141.421 / 5.000",
-        "E-v0",
-        "  td3 (2 seeds) at 20: 99.0 ± 0.0, interquartile mean [99.0, 99.0]",
-        "  sac (1 seed) at 10: 1.0",
+    assert rows_in(lines) == [
+        ["error after", "seeds", "1 step", "10 steps", "50 steps", "200 steps", "no change at all"],
+        ["mixture", "2", "1.500 ± 0.707", "15.000 ± 7.071", "75.000 ± 35.355", "300.000 ± 141.421", "5.000"],
+        ["", "seeds", "steps", "return", "std", "interquartile mean", "95 % interval", "hours"],
+        ["td3", "2", "20", "99.0", "0.0", "99.0", "99.0 to 99.0", ""],
+        ["sac", "1", "10", "1.0", "", "", "", ""],
     ]
     with open(tmp_path / "figure-x.csv", newline="") as file:
         rows = list(csv.DictReader(file))
@@ -68,10 +75,10 @@ def test_a_table_of_hours_is_in_multiples_of_td3(tmp_path: Path) -> None:
         "mbdpg": [make(tmp_path / "mbdpg", {0: 0.0, 10: 1.0, 20: 1.0}, seconds=(0.0, 5400.0, 9999.0))],
     }
     lines = write_figure("table-x", [Curves("E-v0", runs)], tmp_path, as_hours=True)
-    assert lines[1:] == [
-        "E-v0",
-        "  td3: 0.75 hours for 10 steps (1.0 times td3's)",
-        "  mbdpg: 1.50 hours for 10 steps (2.0 times td3's)",
+    assert rows_in(lines) == [
+        ["", "seeds", "steps", "hours", "÷ td3", "machine"],
+        ["td3", "2", "10", "0.75", "1.0", "Fast, 2 cores, Linux"],
+        ["mbdpg", "1", "10", "1.50", "2.0", "Fast, 2 cores, Linux"],
     ]
     assert not (tmp_path / "table-x.png").exists()
 
@@ -81,7 +88,7 @@ def test_missing_timings_are_not_taken_for_no_time(tmp_path: Path) -> None:
     timed = make(tmp_path / "a", {0: 0.0, 10: 1.0}, seconds=(0.0, 7200.0))
     runs = {"td3": [timed, make(tmp_path / "b", {0: 0.0, 10: 1.0})], "sac": [make(tmp_path / "c", {0: 0.0, 10: 1.0})]}
     lines = write_figure("table-x", [Curves("E-v0", runs)], tmp_path, as_hours=True)
-    assert lines[2:] == ["  td3: 2.00 hours for 10 steps (1.0 times td3's)", "  sac: no timings"]
+    assert [row[:5] for row in rows_in(lines)[1:]] == [["td3", "2", "10", "2.00", "1.0"], ["sac", "1", "10", "", ""]]
     with open(tmp_path / "table-x.csv", newline="") as file:
         assert [row["hours"] for row in csv.DictReader(file)] == ["0.0", "2.0", "", "", "", ""]
 
@@ -89,4 +96,21 @@ def test_missing_timings_are_not_taken_for_no_time(tmp_path: Path) -> None:
 def test_runs_without_a_common_step_are_left_out_of_the_picture(tmp_path: Path) -> None:
     runs = {"a": [make(tmp_path / "a", {0: 1.0}), make(tmp_path / "b", {5: 1.0})], "none": []}
     lines = write_figure("figure-x", [Curves("E-v0", runs)], tmp_path)
-    assert lines[2:] == ["E-v0"] and np.size(lines) == 3
+    assert lines[3:6] == ["## E-v0", "", "Nothing to compare yet."]
+
+
+def test_tables_lie_in_a_file_that_says_what_made_them(tmp_path: Path) -> None:
+    """They were printed alone, and nothing said at which commit and on which machine."""
+    td3 = [make(tmp_path / "td3" / f"seed-{i}", {0: 0.0, 10: 5.0}) for i in range(2)]
+    fits = {errors(tmp_path / "models" / "seed-0.csv", 1.0): {"commit": "f" * 40 + "+", "machine": MACHINE}}
+    fits |= {errors(tmp_path / "models" / "seed-1.csv", 1.0): {}}  # of before origins were noted
+    panels = [Curves("E-v0", {"td3": td3}), Curves("again", {"td3": td3}), Errors("models", {"mixture": fits})]
+    lines = write_figure("figure-x", panels, tmp_path, heading=["`mbdpg reproduce`", "The paper says: yes."])
+    text = (tmp_path / "figure-x.md").read_text()
+    assert text.startswith("# figure-x\n\n`mbdpg reproduce`\n\nThe paper says: yes.\n\n## E-v0\n\n| ")
+    assert text.endswith("\n".join(lines[3:]) + "\n")
+    assert lines[-3:] == [
+        "- 2 of 4: commit eeeeeeeeee, on Fast, 2 cores, Linux",
+        "- 1 of 4: commit ffffffffff+, on Fast, 2 cores, Linux",
+        "- 1 of 4: commit —, on a machine that is not noted",
+    ]
