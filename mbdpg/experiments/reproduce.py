@@ -138,6 +138,7 @@ def _draw(chosen: Study, scale: Scale, out: Path, heading: Sequence[str], say: C
         else:
             begun = {cell.label: _training(cell, scale.seeds, scale, out).begun() for cell in panel.cells}
             runs = {label: [Record.read(run, root=out) for run in found] for label, found in begun.items()}
-            panels.append(Curves(panel.title, {label: found for label, found in runs.items() if found}))
+            shown = {label: found for label, found in runs.items() if found}
+            panels.append(Curves(panel.title, shown, panel.published_hours))
     for line in write_figure(chosen.name, panels, out, heading=heading, as_hours=chosen.as_hours):
         say(line)

@@ -54,6 +54,17 @@ def test_they_are_the_papers() -> None:
     assert [model.members for model in study("figure-6", "paper").panels[0].models] == [1, 5, 5, 1]
 
 
+def test_table_1_has_the_papers_hours_beside_the_measured_ones() -> None:
+    table = study("table-1", "quick")
+    hours = {panel.title: panel.published_hours for panel in table.panels}
+    for panel in table.panels:
+        assert panel.published_hours.keys() < {cell.label for cell in panel.cells}
+    assert hours["Ant-v5"]["pets"] == 25.2 and hours["LunarLanderContinuous-v3"]["mbdpg as published"] == 6.2
+    for name, label in (("MBDPG", "mbdpg as published"), ("PETS", "pets"), ("MBPO", "mbpo")):
+        times = [own[label] / own["td3"] for own in hours.values()]
+        assert f"{name} {min(times):.1f} to {max(times):.1f}" in table.claim
+
+
 def test_an_ablation_changes_one_thing() -> None:
     dynamics, demonstrations, values, model = study("figure-9", "paper").panels
     whole, plain = (model.agent for model in dynamics.models)

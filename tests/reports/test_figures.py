@@ -80,6 +80,9 @@ def test_a_table_of_hours_is_in_multiples_of_td3(tmp_path: Path) -> None:
         ["td3", "2", "10", "0.75", "1.0", "Fast, 2 cores, Linux"],
         ["mbdpg", "1", "10", "1.50", "2.0", "Fast, 2 cores, Linux"],
     ]
+    published = [Curves("E-v0", runs, {"td3": 4.0, "pets": 9.0})]
+    lines = write_figure("table-x", published, tmp_path, as_hours=True)
+    assert [row[5:7] for row in rows_in(lines)] == [["paper's hours", "paper's ÷ td3"], ["4.0", "1.0"], ["", ""]]
     assert not (tmp_path / "table-x.png").exists()
 
 
