@@ -54,6 +54,11 @@ def test_they_are_the_papers() -> None:
     assert [model.members for model in study("figure-6", "paper").panels[0].models] == [1, 5, 5, 1]
 
 
+def test_the_claim_of_figure_4_is_what_the_paper_says_of_td3() -> None:
+    """It had TD3 near its best at 200,000 steps."""
+    assert study("figure-4", "paper").claim.endswith("TD3 is still converging at 200,000.")
+
+
 def test_table_1_has_the_papers_hours_beside_the_measured_ones() -> None:
     table = study("table-1", "quick")
     hours = {panel.title: panel.published_hours for panel in table.panels}
