@@ -34,7 +34,7 @@ RECORDED = "HalfCheetah-v5"
 
 FAR: dict[str, Any] = {"fit_length": 10, "burn_in": 5, "dynamics_learning_rate": 1e-3}
 """How dynamics learn that are to predict far ahead: over the paper's L = 10 steps, after five real ones. The default's
-L = 5 is for H = 5."""
+L = 5 is for H = 5. How often agents fit them stays the default's."""
 
 ScaleName = Literal["smoke", "quick", "paper"]
 
