@@ -32,6 +32,7 @@ FAILED = 1
 POLL_SECONDS = 0.5
 ALIVE = "alive"
 """File beside the logs that every process of this machine's holds while it lives."""
+PLATFORM = "JAX_PLATFORMS"
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -175,7 +176,7 @@ class _Pool:
     def _start(self, work: Work, cores: list[int]) -> None:
         process = self._context.Process(target=_in_process, args=(work, cores, log_of(work, self._logs)))
         own = dict.fromkeys(THREADS, str(max(len(cores), 1)))
-        with _environment(own | {"JAX_PLATFORMS": os.environ.get("JAX_PLATFORMS", "cpu")}):
+        with _environment(own | {PLATFORM: os.environ.get(PLATFORM, "cpu")}):
             process.start()
         self._running[process] = (work, cores)
 
@@ -208,18 +209,15 @@ def _in_process(work: Work, cores: list[int], log: Path) -> None:
 
 
 def _on_ray(
-    works: Sequence[Work],
-    engine: Ray,
-    logs: Path,
-    say: Callable[[str], None],
-    should_stop: Callable[[], bool],
+    works: Sequence[Work], engine: Ray, logs: Path, say: Callable[[str], None], should_stop: Callable[[], bool]
 ) -> dict[str, str]:
-    ray = _connected(engine.address)
+    ray, stop_file = _connected(engine.address), logs / f"stop-{os.getpid()}-{time.time_ns()}"
     try:
         require(not engine.gpus or ray.cluster_resources().get("GPU", 0) > 0, "--gpus, but the cluster has none")
         # A process of its own for each, as on one machine; Ray itself begins what died with it again.
-        task = ray.remote(num_cpus=1, num_gpus=int(engine.gpus), max_calls=1, max_retries=ATTEMPTS - 1)(_as_task)
-        stop_file = logs / f"stop-{os.getpid()}-{time.time_ns()}"
+        options: dict[str, Any] = {"num_cpus": 1, "num_gpus": int(engine.gpus), "max_calls": 1}
+        options |= {} if engine.gpus else {"runtime_env": {"env_vars": {PLATFORM: os.environ.get(PLATFORM, "cpu")}}}
+        task = ray.remote(**options, max_retries=ATTEMPTS - 1)(_as_task)
         running = {task.remote(work, log_of(work, logs), stop_file): work for work in works}
         failures: dict[str, str] = {}
         while running:
@@ -235,10 +233,10 @@ def _on_ray(
                     failures[work.name] = problem
                 if problem or work.finished():
                     say(f"{work.name}: " + (f"failed, {problem}" if problem else "done"))
-        stop_file.unlink(missing_ok=True)
         return failures
     finally:
         ray.shutdown()
+        stop_file.unlink(missing_ok=True)
 
 
 def _as_task(work: Work, log: Path, stop_file: Path) -> str | None:
@@ -275,8 +273,9 @@ def _connected(address: str | None) -> Any:
         ray.init(address=address, **options)
     except (ConnectionError, ValueError, RuntimeError) as error:
         raise UserError(f"--address is {address}, where no Ray cluster answers: {error}") from error
-    for number, handler in handlers.items():  # of which Ray took one
-        signal.signal(number, handler)
+    finally:
+        for number, handler in handlers.items():  # of which Ray took one
+            signal.signal(number, handler)
     return ray
 
 

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from threading import Timer
 from typing import Any
@@ -160,3 +160,71 @@ def test_no_worker_and_no_ray_are_said_in_one_line(monkeypatch: pytest.MonkeyPat
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(UserError, match=r"needs Ray, which is not installed: pip install 'mbdpg\[ray\]'"):
         launch([piece("a")], Ray(), logs=tmp_path, say=lambda line: None)
+
+
+class Cluster:
+    """In the place of the module `ray`: what it is asked for, and nothing done."""
+
+    def __init__(self) -> None:
+        self.options: dict[str, Any] = {}
+        self.problem: type[BaseException] | None = None
+        """Raised where work is waited for."""
+        self.refused = False
+
+    def init(self, **options: Any) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        if self.refused:
+            raise ConnectionError("no")
+
+    def cluster_resources(self) -> dict[str, float]:
+        return {"GPU": 1.0}
+
+    def remote(self, **options: Any) -> Any:
+        self.options = options
+        return lambda function: type("Task", (), {"remote": staticmethod(lambda *given: given)})
+
+    def wait(self, running: list[Any], timeout: float) -> tuple[list[Any], list[Any]]:
+        if self.problem:
+            raise self.problem
+        return running, []
+
+    def get(self, reference: Any) -> str:
+        return "not done"
+
+    def shutdown(self) -> None: ...
+
+
+@pytest.fixture
+def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Cluster]:
+    made, before = Cluster(), signal.getsignal(signal.SIGTERM)
+    monkeypatch.setitem(sys.modules, "ray", made)
+    yield made
+    signal.signal(signal.SIGTERM, before)
+
+
+@pytest.mark.parametrize("given", [None, "tpu"])
+def test_work_on_a_cluster_takes_no_gpu_that_was_not_asked_for(
+    cluster: Cluster, monkeypatch: pytest.MonkeyPatch, piece: Any, tmp_path: Path, given: str | None
+) -> None:
+    """Without --gpus, pieces on a node that has one would all have filled it."""
+    monkeypatch.delenv("JAX_PLATFORMS", raising=False)
+    if given:
+        monkeypatch.setenv("JAX_PLATFORMS", given)
+    launch([piece("a")], Ray(), logs=tmp_path, say=lambda line: None)
+    assert cluster.options["runtime_env"] == {"env_vars": {"JAX_PLATFORMS": given or "cpu"}}
+    launch([piece("a")], Ray(gpus=True), logs=tmp_path, say=lambda line: None)
+    assert cluster.options["num_gpus"] == 1 and "runtime_env" not in cluster.options
+
+
+def test_a_cluster_that_refuses_leaves_signals_as_they_were(cluster: Cluster, piece: Any, tmp_path: Path) -> None:
+    before, cluster.refused = signal.getsignal(signal.SIGTERM), True
+    with pytest.raises(UserError, match="where no Ray cluster answers: no"):
+        launch([piece("a")], Ray(), logs=tmp_path, say=lambda line: None)
+    assert signal.getsignal(signal.SIGTERM) == before
+
+
+def test_an_error_leaves_no_file_that_asks_to_stop(cluster: Cluster, piece: Any, tmp_path: Path) -> None:
+    cluster.problem = KeyboardInterrupt
+    with pytest.raises(KeyboardInterrupt):
+        launch([piece("a")], Ray(), logs=tmp_path / "logs", say=lambda line: None, should_stop=lambda: True)
+    assert list((tmp_path / "logs").iterdir()) == []
