@@ -19,7 +19,7 @@ from mbdpg.experiments.launch import Local, Ray, launch
 from mbdpg.experiments.search import Search
 from mbdpg.experiments.work import Training
 from mbdpg.interfaces import UserError, flag_of, require
-from mbdpg.reports.record import learning_curve
+from mbdpg.reports.record import Curve, learning_curve, mean_curve
 from mbdpg.storage.files import DamagedFileError, parse_object, read_checked, replace_durably, replace_table
 from mbdpg.storage.run_folder import only_writer
 from mbdpg.training.loop import Update
@@ -166,11 +166,9 @@ def _drop_torn_line(journal: Path) -> None:
             file.truncate(file.read().rfind(b"\n") + 1)
 
 
-def returns(training: Training) -> dict[int, float]:
+def returns(training: Training) -> Curve:
     """Mean evaluation return over seeds at every step at which all of them were evaluated."""
-    curves = [learning_curve(run) if (run / "metrics.jsonl").is_file() else {} for run in training.runs()]
-    shared = sorted(set.intersection(*map(set, curves)))
-    return {step: float(np.mean([curve[step] for curve in curves])) for step in shared}
+    return mean_curve([learning_curve(run) if (run / "metrics.jsonl").is_file() else {} for run in training.runs()])
 
 
 def score(training: Training) -> float:

@@ -7,13 +7,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import matplotlib
-import numpy as np
 
 matplotlib.use("Agg")  # no display is ever needed
 from matplotlib import pyplot as plt
 
 from mbdpg.interfaces import UserError
-from mbdpg.reports.record import learning_curve
+from mbdpg.reports.record import learning_curve, mean_curve
 from mbdpg.storage.files import replace_durably
 
 
@@ -37,10 +36,9 @@ def draw_curves(groups: Mapping[str, Sequence[Path]], path: Path, *, title: str)
             continue
         for curve in curves:
             axes.plot(list(curve), list(curve.values()), color=f"C{number}", alpha=0.35, linewidth=1)
-        shared = sorted(set.intersection(*map(set, curves)))
-        mean = [np.mean([curve[step] for curve in curves]) for step in shared]
+        mean = mean_curve(curves)
         seeds = f"{len(curves)} seed{'s' * (len(curves) > 1)}"
-        axes.plot(shared, mean, color=f"C{number}", linewidth=2, label=f"{label} ({seeds})")
+        axes.plot(list(mean), list(mean.values()), color=f"C{number}", linewidth=2, label=f"{label} ({seeds})")
     axes.set(xlabel="environment steps", ylabel="evaluation return", title=title)
     axes.grid(alpha=0.3)
     axes.legend()

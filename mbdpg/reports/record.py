@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from mbdpg.interfaces import UserError, require
 from mbdpg.storage.metrics import read_metrics
 from mbdpg.storage.run_folder import RunFolder
@@ -129,6 +131,11 @@ def shared_steps(curves: Iterable[Mapping[int, Any]]) -> list[int]:
     """Environment steps that all have, in order."""
     steps = [set(curve) for curve in curves]
     return sorted(set.intersection(*steps)) if steps else []
+
+
+def mean_curve(curves: Sequence[Curve]) -> Curve:
+    """Their mean at the steps that all have."""
+    return {step: float(np.mean([curve[step] for curve in curves])) for step in shared_steps(curves)}
 
 
 def numbers(columns: Mapping[str, list[Any]], name: str) -> list[float | None]:
