@@ -45,7 +45,7 @@ test-extras: $(VENV)/.installed-extras
 	@$(BIN)/python -m pytest -q -m extras --timeout 600 $(ARGS)
 
 test-gpu: setup-dev
-	@JAX_PLATFORMS=cuda,cpu $(BIN)/python -m pytest -q -m gpu --timeout 600 $(ARGS)
+	@JAX_PLATFORMS=$${JAX_PLATFORMS:-cuda,cpu} $(BIN)/python -m pytest -q -m gpu --timeout 600 $(ARGS)
 
 test-browser: setup-dev
 	@$(BIN)/python -m pytest -q -m browser $(ARGS)

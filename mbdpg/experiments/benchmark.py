@@ -25,6 +25,7 @@ import numpy as np
 from mbdpg.agents import mbdpg
 from mbdpg.experiments.config import RunConfig
 from mbdpg.interfaces import Agent, EnvSpec, Phase
+from mbdpg.networks.mlp import matrix_product
 from mbdpg.storage.run_folder import describe_machine
 from mbdpg.training.learner import Learner
 from mbdpg.training.replay import Replay
@@ -157,7 +158,7 @@ def _product_seconds(product: Product) -> float:
     rng = np.random.default_rng(0)
     left = jnp.asarray(rng.normal(size=(repeats, product.batch, product.rows, product.inner)), jnp.float32)
     right = jnp.asarray(rng.normal(size=(product.batch, product.inner, product.columns)), jnp.float32)
-    loop = jax.jit(lambda left, right: jax.lax.map(lambda x: x @ right, left))
+    loop = jax.jit(lambda left, right: jax.lax.map(lambda x: matrix_product(x, right), left))
     return _median_seconds(lambda: loop(left, right).block_until_ready()) / repeats
 
 
@@ -193,8 +194,8 @@ def _starting(say: Callable[[str], None]) -> dict[str, float]:
             command = [sys.executable, "-c", code, settings, str(REPLAY_ROWS), str(time.time())]
             done = subprocess.run(command, env=os.environ | keep, stdout=subprocess.PIPE, text=True, check=True)
             measured = json.loads(done.stdout)
-            # Of both, the one that compiles takes more.
-            result |= {name: measured["seconds"]}
+            result[name] = measured["seconds"]
+            # Of both: the one that compiles takes more.
             result["peak_memory_mb"] = max(result.get("peak_memory_mb", 0.0), measured["memory_mb"])
     say(f"from the start to the first updates: {result['cold_start_s']:.1f} s, compiled {result['warm_start_s']:.1f} s")
     say(f"peak memory with {REPLAY_ROWS:,} steps: {result['peak_memory_mb']:.0f} MiB")

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from mbdpg.dynamics.planning import Planner, PlanningPolicy
 from mbdpg.interfaces import Acting, Agent, Batch, Metrics, Phase, Statistics, UserError
@@ -43,6 +43,8 @@ class Learner:
         self._keys = jax.vmap(jax.random.key)(jnp.asarray(seeds, jnp.uint32))
         init_keys = jax.vmap(jax.random.fold_in, (0, None))(self._keys, 0)
         mesh = seed_mesh(len(seeds), jax.local_devices() if devices is None else devices)
+        if devices is not None:
+            init_keys = jax.device_put(init_keys, NamedSharding(mesh, _seed_axis()))
         self.state = jax.jit(over_seeds(lambda key: agent.init(key=key), mesh))(init_keys)
         self._prepare = jax.jit(over_seeds(agent.prepare, mesh), donate_argnums=0)
         self._diagnose = jax.jit(over_seeds(agent.diagnose, mesh))
@@ -109,7 +111,8 @@ class Learner:
                         f"expected {leaf.dtype}{list(leaf.shape[1:])}"
                     )
                 arrays.append(found)
-            return jax.device_put(np.stack(arrays), leaf.sharding)
+            # Bound to a device only if it was: else the updates would be compiled anew, for another kind of argument.
+            return jax.device_put(np.stack(arrays), leaf.sharding if leaf.committed else None)
 
         self.state = jax.tree_util.tree_map_with_path(put, self.state)
 
@@ -123,27 +126,21 @@ def seed_mesh(seeds: int, devices: Sequence[jax.Device]) -> Mesh:
 def over_seeds(function: Any, mesh: Mesh) -> Any:
     """Map a one-seed function over leading seed axes, each device its own seeds.
 
-    On CPU one seed after the other, which computes for each exactly what it would alone; elsewhere all at once, with
-    products of float32: a GPU's default rounds what it multiplies to ten bits, and imagination feeds errors back.
+    On CPU one seed after the other, which computes for each exactly what it would alone; elsewhere all at once.
     """
-    each = _one_by_one(function) if jax.default_backend() == "cpu" else jax.vmap(_in_float32(function))
+    each = _one_by_one(function) if mesh.devices.flat[0].platform == "cpu" else jax.vmap(function)
     if mesh.size == 1:
         return each
     # Seeds tell each other nothing, so that there is nothing to check of what varies over devices.
-    own = PartitionSpec("seed")  # type: ignore[no-untyped-call]
-    return jax.shard_map(each, mesh=mesh, in_specs=own, out_specs=own, check_vma=False)
+    return jax.shard_map(each, mesh=mesh, in_specs=_seed_axis(), out_specs=_seed_axis(), check_vma=False)
+
+
+def _seed_axis() -> PartitionSpec:
+    return PartitionSpec("seed")  # type: ignore[no-untyped-call]
 
 
 def _one_by_one(function: Any) -> Any:
     return lambda *args: jax.lax.map(lambda packed: function(*packed), args)
-
-
-def _in_float32(function: Any) -> Any:
-    def traced(*args: Any) -> Any:
-        with jax.default_matmul_precision("float32"):
-            return function(*args)
-
-    return traced
 
 
 def _compile(phase: Phase, mesh: Mesh) -> Any:

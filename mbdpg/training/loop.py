@@ -6,9 +6,8 @@ import contextlib
 import math
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -18,8 +17,6 @@ from mbdpg.training.collector import Collector
 from mbdpg.training.evaluation import Evaluation, StoppedError, diagnosis_windows, evaluate
 from mbdpg.training.learner import Learner
 from mbdpg.training.randomness import random_stream
-
-Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -160,8 +157,9 @@ class Training:
         return self.env_steps % every == 0 or self.env_steps == self.schedule.steps
 
     def _collect(self, policies: Sequence[Acting], stds: np.ndarray) -> None:
-        began, cycle = time.monotonic(), self.schedule.cycle
-        _for_each_seed(lambda i: self.collectors[i].collect(policies[i], float(stds[i]), cycle), len(policies))
+        began = time.monotonic()
+        for collector, policy, std in zip(self.collectors, policies, stds, strict=True):
+            collector.collect(policy, float(std), self.schedule.cycle)
         self.env_steps += self.schedule.cycle
         self._seconds["acting"] += time.monotonic() - began
 
@@ -201,17 +199,17 @@ class Training:
                 sums[name] = [total + float(values[index]), count + 1]
 
     def _evaluate(self, should_stop: Callable[[], bool]) -> list[Evaluation]:
-        began, policies = time.monotonic(), self.learner.policies()
-
-        def one(index: int) -> Evaluation:
+        began = time.monotonic()
+        policies, evaluations = self.learner.policies(), []
+        for collector, policy in zip(self.collectors, policies, strict=True):
             # The same episodes for every agent and at every evaluation: paired, so that differences are the policies'.
-            episodes = range(self.schedule.evaluation_episodes)
-            seeds = [episode_seed(self.collectors[index].seed, "evaluate", episode) for episode in episodes]
+            seeds = [
+                episode_seed(collector.seed, "evaluate", episode)
+                for episode in range(self.schedule.evaluation_episodes)
+            ]
             # A fresh environment: a resumed run has no used one, and a fault must not outlive its evaluation.
             with contextlib.closing(self._make_env()) as env:
-                return evaluate(env, policies[index], seeds, should_stop=should_stop)
-
-        evaluations = _for_each_seed(one, len(policies))
+                evaluations.append(evaluate(env, policy, seeds, should_stop=should_stop))
         metrics = self._diagnose(evaluations)
         self._seconds["evaluating"] += time.monotonic() - began
         for index, (recorder, evaluation) in enumerate(zip(self._recorders, evaluations, strict=True)):
@@ -260,14 +258,3 @@ class Training:
         """Seconds since this process began the run, and where they went."""
         parts = {f"time/{name}": seconds for name, seconds in self._seconds.items()}
         return {"time/seconds": time.monotonic() - self._began} | parts
-
-
-def _for_each_seed(call: Callable[[int], Result], seeds: int) -> list[Result]:
-    """Call with every seed's index: of several, each in a thread, since simulators let others run while they compute.
-
-    One seed's environment stays in this thread, which some windows and devices insist on.
-    """
-    if seeds == 1:
-        return [call(0)]
-    with ThreadPoolExecutor(seeds) as pool:
-        return list(pool.map(call, range(seeds)))

@@ -121,3 +121,9 @@ def test_the_gradient_reaches_every_parameter(key: jax.Array) -> None:
         mlp, jnp.asarray(np.random.default_rng(3).normal(size=(5, 3)), jnp.float32)
     )
     assert all(leaf.any() for leaf in jax.tree.leaves(gradient))
+
+
+def test_products_are_of_float32_forwards_and_backwards_and_not_of_what_a_gpu_takes_for_one(key: jax.Array) -> None:
+    layer = Linear(3, 2, key=key)
+    program = jax.make_jaxpr(jax.grad(lambda layer, x: jnp.sum(layer(x) ** 2), argnums=(0, 1)))(layer, jnp.ones((4, 3)))
+    assert str(program).count("dot_general[") == 3 and str(program).count("HIGHEST") == 6

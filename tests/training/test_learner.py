@@ -155,20 +155,11 @@ def test_seeds_shared_by_two_devices_learn_what_each_learns_alone_but_for_roundi
 def test_an_accelerator_learns_what_the_cpu_learns_but_for_rounding(name: str) -> None:
     learners = []
     for device in (jax.devices()[0], jax.devices("cpu")[0]):
-        with jax.default_device(device):
-            learners.append(Learner(MAKERS[name](), [4, 9]))
-            learn(learners[-1], [4, 9])
-    assert {leaf.device for leaf in jax.tree.leaves(learners[0].state)} == {jax.devices()[0]}
+        learners.append(Learner(MAKERS[name](), [4, 9], [device]))
+        learn(learners[-1], [4, 9])
+        assert all(leaf.devices() == {device} for leaf in jax.tree.leaves(learners[-1].state))
     for seed in range(2):
         same_but_for_rounding(*(learner.snapshot(seed) for learner in learners))
-
-
-def test_products_on_an_accelerator_are_of_float32_and_not_of_what_it_takes_for_one(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    mapped = learner_module.over_seeds(lambda x: x @ x, learner_module.seed_mesh(1, ONE))
-    assert str(jax.make_jaxpr(mapped)(np.ones((2, 3, 3), np.float32))).count("HIGHEST") == 2
 
 
 @pytest.mark.parametrize(("seeds", "used"), [(1, 1), (2, 2), (3, 1), (4, 2)])
@@ -197,6 +188,16 @@ def test_a_learner_goes_on_bitwise_from_a_snapshot(two: Two) -> None:
     for found, wanted in zip(learn(two.alone, [9], range(7, 8)), expected, strict=True):
         assert same(found, wanted)
     assert same(two.alone.snapshot(0), after)
+
+
+@pytest.mark.parametrize("devices", [None, ONE, BOTH], ids=["default", "one device", "two devices"])
+def test_a_restored_state_is_no_other_kind_of_argument_for_which_everything_is_compiled_again(
+    devices: list[jax.Device] | None, toy: Any
+) -> None:
+    learner = Learner(toy.ToyAgent(SPEC), [4, 9, 2] if devices is None else [4, 9], devices)
+    before = [(leaf.committed, leaf.sharding) for leaf in jax.tree.leaves(learner.state)]
+    learner.restore([learner.snapshot(index) for index in range(len(learner.policies()))])
+    assert [(leaf.committed, leaf.sharding) for leaf in jax.tree.leaves(learner.state)] == before
 
 
 def test_a_snapshot_is_a_copy_that_later_updates_do_not_change(two: Two) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import json
 import math
-import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -15,7 +14,7 @@ import pytest
 
 from mbdpg.interfaces import Phase, Sampling, UserError
 from mbdpg.training.evaluation import Evaluation
-from mbdpg.training.loop import Schedule, Update, _for_each_seed
+from mbdpg.training.loop import Schedule, Update
 from mbdpg.training.replay import Replay
 
 STEPS = 60
@@ -327,17 +326,3 @@ def test_evaluation_is_a_plain_tuple_of_what_a_callback_needs(whole: Any) -> Non
     assert isinstance(updates[0].evaluation[0], Evaluation)
     assert math.isnan(updates[0].train_returns[0])
     assert math.isfinite(updates[-1].train_returns[0])
-
-
-def test_environments_of_several_seeds_step_at_once_and_a_lone_one_in_the_thread_that_made_it() -> None:
-    meet = threading.Barrier(2, timeout=20)  # breaks if one has to end before the other begins
-    assert _for_each_seed(lambda index: (meet.wait() >= 0, index), 2) == [(True, 0), (True, 1)]
-    assert _for_each_seed(lambda index: threading.current_thread(), 1) == [threading.main_thread()]
-
-
-def test_a_fault_in_one_seed_s_thread_ends_the_run_with_its_own_message() -> None:
-    def fail(index: int) -> None:
-        raise UserError(f"seed {index} failed 10 times in a row")
-
-    with pytest.raises(UserError, match="seed 0 failed"):
-        _for_each_seed(fail, 2)
