@@ -136,6 +136,8 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--peers", type=Path, default=Path(".venv-peers/bin/python"), help="has torch")
     flags = parser.parse_args()
+    if flags.train % 5000 and flags.train > 5000:
+        parser.error(f"--train is {flags.train}, expected a multiple of 5,000, where all are evaluated")
     threads = len(os.sched_getaffinity(0))
     rows = updates(flags.peers, flags.rounds, threads)
     if flags.train:

@@ -9,7 +9,7 @@ import numpy as np
 
 from mbdpg import envs
 from mbdpg.dynamics.planning import PlanningPolicy
-from mbdpg.experiments import run
+from mbdpg.experiments import resuming, run
 from mbdpg.experiments.config import AgentConfig, RunConfig
 from mbdpg.experiments.presets import agent_config
 from mbdpg.interfaces import Environment
@@ -79,7 +79,7 @@ def resume(
         UserError: not a run, or damaged beyond its checkpoints.
     """
     on_update = _only_evaluations(on_evaluation)
-    run.resume([Path(path)], make_env=_maker(env), steps=steps, watch=lambda *_: on_update)
+    resuming.resume([Path(path)], make_env=_maker(env), steps=steps, watch=lambda *_: on_update)
 
 
 def load_policy(path: str | Path, *, best: bool = False) -> NumpyPolicy | PlanningPolicy:

@@ -15,8 +15,8 @@ from collections import defaultdict
 from pathlib import Path
 
 import matplotlib
-import numpy as np
 
+from mbdpg.reports.record import mean_curve
 from mbdpg.reports.statistics import summarize
 from mbdpg.storage.metrics import read_metrics
 from mbdpg.storage.run_folder import RunFolder
@@ -71,7 +71,7 @@ def collect(name: str, runs: list[Path]) -> None:
 
 
 def read(name: str) -> tuple[str, dict[str, Curves]]:
-    """The task of NAME.csv, and its learning curves by algorithm."""
+    """The task of NAME.csv, and learning curves by algorithm: its own, and its rivals' on the same task."""
     curves: dict[str, Curves] = defaultdict(lambda: defaultdict(dict))
     env = _add(curves, name, None)
     for rival in RIVALS:
@@ -104,26 +104,23 @@ def tell(curves: dict[str, Curves]) -> None:
 
 
 def draw(name: str, env: str, curves: dict[str, Curves]) -> None:
-    """Write NAME.png: curves, and others' means at the budgets that they have published."""
+    """Write NAME.png: our curves, and what others have published of theirs."""
     figure, axes = plt.subplots(figsize=(8, 4.6), layout="constrained")
     for number, (algorithm, seeds) in enumerate(curves.items()):
         for curve in seeds.values():
             axes.plot(list(curve), list(curve.values()), color=f"C{number}", alpha=0.35, linewidth=1)
-        shared = sorted(set.intersection(*map(set, seeds.values())))
-        mean = [np.mean([curve[step] for curve in seeds.values()]) for step in shared]
+        mean = mean_curve(list(seeds.values()))
         several = f"{len(seeds)} seed{'s' * (len(seeds) > 1)}"
-        axes.plot(shared, mean, color=f"C{number}", linewidth=2, label=f"{algorithm} ({several})")
+        axes.plot(list(mean), list(mean.values()), color=f"C{number}", linewidth=2, label=f"{algorithm} ({several})")
     others = defaultdict(list)
     with open(HERE / "published.csv", newline="") as file:
         for row in csv.DictReader(file):
             if row["env"] == env.rpartition("-v")[0]:
                 others[row["method"], row["id"]].append((int(row["env_steps"]), float(row["mean"])))
     for style, ((method, version), points) in enumerate(others.items()):
-        kind = (
-            {"linestyle": LINES[style % len(LINES)]} if len(points) > 2 else {"linestyle": "", "marker": MARKS[style]}
-        )
-        label = f"{method} ({version}, published)"
-        axes.plot(*zip(*points, strict=True), color="0.35", fillstyle="none", linewidth=1, label=label, **kind)
+        line, mark = (LINES[style % len(LINES)], "") if len(points) > 2 else ("", MARKS[style % len(MARKS)])
+        drawn = {"color": "0.35", "fillstyle": "none", "linewidth": 1, "linestyle": line, "marker": mark}
+        axes.plot(*zip(*points, strict=True), label=f"{method} ({version}, published)", **drawn)
     axes.set(xlabel="environment steps", ylabel="evaluation return", title=env)
     axes.grid(alpha=0.3)
     axes.legend(fontsize="small")

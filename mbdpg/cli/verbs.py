@@ -24,7 +24,8 @@ from mbdpg.cli.train import finish, train
 from mbdpg.experiments import benchmark
 from mbdpg.experiments.compilations import keep_compilations
 from mbdpg.experiments.config import RunConfig
-from mbdpg.experiments.run import load_policy, resume
+from mbdpg.experiments.resuming import resume
+from mbdpg.experiments.run import load_policy
 from mbdpg.experiments.stopping import Stop
 from mbdpg.interfaces import require
 from mbdpg.reports.console import RunDisplay
@@ -94,7 +95,8 @@ def _resume(args: list[str]) -> None:
             def display(going: Sequence[Path], config: RunConfig, env_steps: int) -> RunDisplay:
                 displays.close()  # of those before
                 if env_steps >= config.schedule.steps:
-                    print(f"{', '.join(map(str, going))} has its {env_steps:,} steps already; --steps makes it longer")
+                    for run in going:
+                        print(f"{run} has its {env_steps:,} steps already; --steps makes it longer")
                 return displays.enter_context(RunDisplay(config.schedule.steps, done=env_steps))
 
             resume(runs, steps=flags.steps, allow_import=flags.allow_import, watch=display, should_stop=stop)

@@ -24,9 +24,9 @@ import numpy as np
 
 from mbdpg.agents import mbdpg
 from mbdpg.experiments.config import RunConfig
+from mbdpg.experiments.origin import machine
 from mbdpg.interfaces import Agent, EnvSpec, Phase
 from mbdpg.networks.mlp import matrix_product
-from mbdpg.storage.run_folder import describe_machine
 from mbdpg.training.learner import Learner
 from mbdpg.training.replay import Replay
 
@@ -100,7 +100,7 @@ def benchmark(say: Callable[[str], None], *, growth: bool = True) -> dict[str, A
     result |= _acting(say) | _starting(say)
     if growth:
         result["growth_ms"] = _growth(say)
-    return result | {"task": TASK, "sizes": dataclasses.asdict(PAPER_SIZES), "machine": describe_machine()}
+    return result | {"task": TASK, "sizes": dataclasses.asdict(PAPER_SIZES), "machine": machine()}
 
 
 def cost_of(phase_name: str, config: mbdpg.Config) -> Cost:

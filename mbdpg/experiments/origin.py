@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 import subprocess
+from collections import Counter
 from pathlib import Path
 from typing import Any
+
+import jax
 
 from mbdpg.storage.run_folder import describe_machine
 
 
 def origin() -> dict[str, Any]:
     """Commit and machine of this process (JSON), as a run's config and the note beside a file record them."""
-    return {"commit": _commit(), "machine": describe_machine()}
+    return {"commit": _commit(), "machine": machine()}
+
+
+def machine() -> dict[str, Any]:
+    """What decides whether a run repeats bit for bit: that of the host, and the devices that JAX computes on (JSON)."""
+    kinds = Counter(device.device_kind for device in jax.local_devices())
+    return describe_machine() | {"devices": ", ".join(f"{count} × {kind}" for kind, count in sorted(kinds.items()))}
 
 
 def _commit() -> str | None:

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
-import json
 import sys
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from mbdpg.agents import mbdpg, mbpo, pets, sac, td3
 from mbdpg.dynamics.planning import PlanningPolicy, is_planner, planner_of
@@ -20,8 +17,8 @@ from mbdpg.imitation.demonstrations import Demonstrations
 from mbdpg.interfaces import Agent, Environment, EnvSpec, UserError, require
 from mbdpg.networks.policy import NumpyPolicy
 from mbdpg.storage.array_file import read_array_file
-from mbdpg.storage.checkpoint import Checkpoint, load_checkpoint
-from mbdpg.storage.run_folder import RunFolder, describe_machine
+from mbdpg.storage.checkpoint import Checkpoint
+from mbdpg.storage.run_folder import RunFolder
 from mbdpg.training.collector import Collector
 from mbdpg.training.learner import Learner
 from mbdpg.training.loop import Training, Update
@@ -60,7 +57,7 @@ def train(
     require(len(seeds) > 0 and len(set(seeds)) == len(seeds), f"{given} one number or more, all different")
     require(all(0 <= seed < 2**31 for seed in seeds), f"{given} numbers from 0 to 2^31 - 1")
     make = make_env or config.make_env
-    spec = _spec_of(make)
+    spec = spec_of(make)
     demonstrations = Demonstrations.load(Path(config.demonstrations), spec) if config.demonstrations else None
     description = config.to_json() | origin()
     folders: list[RunFolder] = []
@@ -69,7 +66,7 @@ def train(
             facts = {"seed": seed, "custom_env": make_env is not None}
             folders.append(RunFolder.create(out / f"seed-{seed}", description | facts, undo=undo))
             stack.enter_context(folders[-1].locked())
-        training = _compose(config, spec, make, seeds, [Recorder(folder) for folder in folders], stack, demonstrations)
+        training = compose(config, spec, make, seeds, [Recorder(folder) for folder in folders], stack, demonstrations)
         training.save()
         undo.pop_all()  # from here on, there is something to go on from
         if config.schedule.steps <= config.agent.random_steps:
@@ -80,108 +77,6 @@ def train(
             )
         training.run(on_update, should_stop)
     return [folder.path for folder in folders]
-
-
-def resume(
-    runs: Sequence[Path],
-    *,
-    make_env: MakeEnvironment | None = None,
-    steps: int | None = None,
-    allow_import: bool = False,
-    watch: Callable[[Sequence[Path], RunConfig, int], OnUpdate] = lambda runs, config, env_steps: lambda update: None,
-    should_stop: Callable[[], bool] = lambda: False,
-) -> None:
-    """Go on with runs, each exactly where its newest undamaged checkpoint is.
-
-    Runs that differ in nothing but their seed and stand at the same place go on at once, as they were begun.
-
-    Args:
-        runs: the run folders.
-        make_env: as for `train`; needed if a run was given one.
-        steps: environment steps of each whole run, if it shall be longer than it was meant to be.
-        allow_import: allow an id of the form module:Id, whatever the folder says: it may come from a stranger.
-        watch: given runs that go on at once, their config and the step they go on from, returns what `train` calls
-            `on_update`.
-        should_stop: as for `train`.
-
-    Raises:
-        UserError: not a run, damaged beyond its checkpoints, or of another configuration or environment.
-    """
-    with contextlib.ExitStack() as stack:
-        together: dict[str, list[_Saved]] = defaultdict(list)
-        for path in runs:
-            saved = _saved(path, stack, make_env is not None, steps, allow_import)
-            together[saved.place].append(saved)
-        for group in together.values():
-            if not should_stop():
-                _go_on(group, make_env or group[0].config.make_env, watch, should_stop)
-
-
-class _Saved(NamedTuple):
-    """A run that is to go on."""
-
-    folder: RunFolder
-    config: RunConfig
-    checkpoint: Checkpoint
-
-    @property
-    def place(self) -> str:
-        """The same for runs that can go on at once."""
-        facts = {name: self.checkpoint.facts.get(name) for name in ("updates", "recorded", "expert_env_steps")}
-        return json.dumps([self.config.to_json(), self.checkpoint.env_steps, facts], sort_keys=True)
-
-
-def _saved(path: Path, stack: contextlib.ExitStack, has_env: bool, steps: int | None, allow_import: bool) -> _Saved:
-    """Lock and read a run."""
-    folder = RunFolder.open(path)
-    try:
-        config = RunConfig.from_json(folder.config)
-    except UserError as error:
-        raise UserError(f"{path} cannot be resumed, {error}; put its config.json back as it was") from error
-    config = dataclasses.replace(config, env_options=dataclasses.replace(config.env_options, allow_import=allow_import))
-    if folder.config.get("custom_env") and not has_env:
-        raise UserError(f"{path} trained an environment made in code; resume it with mbdpg.resume(..., env=...)")
-    stack.enter_context(folder.locked())
-    checkpoint = load_checkpoint(path)
-    with _as_written_by_us([path], checkpoint.env_steps):
-        planned = max(int(checkpoint.facts["steps"]), config.schedule.steps)
-    require(
-        steps is None or steps >= checkpoint.env_steps,
-        f"--steps is {steps}, but {path} has {checkpoint.env_steps} behind it; expected at least as many",
-    )
-    schedule = dataclasses.replace(config.schedule, steps=planned if steps is None else steps)
-    return _Saved(folder, dataclasses.replace(config, schedule=schedule), checkpoint)
-
-
-def _go_on(
-    group: Sequence[_Saved],
-    make: MakeEnvironment,
-    watch: Callable[[Sequence[Path], RunConfig, int], OnUpdate],
-    should_stop: Callable[[], bool],
-) -> None:
-    """Train on, all in this process."""
-    paths, config, checkpoints = [s.folder.path for s in group], group[0].config, [s.checkpoint for s in group]
-    spec = _spec_of(make)
-    with contextlib.ExitStack() as stack:
-        with _as_written_by_us(paths, checkpoints[0].env_steps):
-            recorders = [Recorder(s.folder, s.checkpoint) for s in group]
-            seeds = [_seed_of(s.folder) for s in group]
-            training = _compose(config, spec, make, seeds, recorders, stack, None, checkpoints)
-        for s in group:
-            _say_what_changed(s.folder.path, s.folder.config.get("machine"))
-        training.run(watch(paths, config, training.env_steps), should_stop)
-
-
-@contextlib.contextmanager
-def _as_written_by_us(runs: Sequence[Path], env_steps: int) -> Iterator[None]:
-    """Whatever a stranger's checkpoint makes fail is said in one line."""
-    try:
-        yield
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        names = ", ".join(map(str, runs))
-        raise UserError(
-            f"the checkpoint of {names} at {env_steps} steps is not one that mbdpg wrote ({error!r})"
-        ) from error
 
 
 def load_policy(path: Path, *, best: bool = False, spec: EnvSpec | None = None) -> NumpyPolicy | PlanningPolicy:
@@ -228,7 +123,7 @@ def make_agent(config: RunConfig, spec: EnvSpec) -> Agent:
             return pets.PETS(config.agent, spec)
 
 
-def _compose(
+def compose(
     config: RunConfig,
     spec: EnvSpec,
     make: MakeEnvironment,
@@ -275,18 +170,8 @@ def _compose(
     return training
 
 
-def _say_what_changed(path: Path, recorded: Any) -> None:
-    """A resume repeats bytes only on the same processor, cores and versions: say what is another one now."""
-    before: dict[str, Any] = recorded if isinstance(recorded, dict) else {}
-    versions, now = before.get("versions"), describe_machine()
-    versions = versions if isinstance(versions, dict) else {}
-    changed = [name for name in ("cpu", "cores", "python", "XLA_FLAGS") if before.get(name) != now[name]]
-    changed += [name for name, version in now["versions"].items() if versions.get(name) != version]
-    if changed:
-        print(f"mbdpg: {path} was begun with another {', '.join(changed)}; its results may differ", file=sys.stderr)
-
-
-def _spec_of(make: MakeEnvironment) -> EnvSpec:
+def spec_of(make: MakeEnvironment) -> EnvSpec:
+    """What an environment tells agents, asked of one that is closed again; it must end some time."""
     env = make()
     env.close()
     spec = env.spec
@@ -296,10 +181,3 @@ def _spec_of(make: MakeEnvironment) -> EnvSpec:
         "in gymnasium.wrappers.TimeLimit",
     )
     return spec
-
-
-def _seed_of(folder: RunFolder) -> int:
-    seed = folder.config.get("seed")
-    fits = isinstance(seed, int) and 0 <= seed < 2**31
-    require(fits, f"{folder.path} has seed {seed!r} in its config.json, expected a number from 0 to 2^31 - 1")
-    return int(seed)  # type: ignore[arg-type]  # checked above

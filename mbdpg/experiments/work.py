@@ -13,7 +13,8 @@ from mbdpg.experiments import expert
 from mbdpg.experiments.compilations import keep_compilations
 from mbdpg.experiments.config import RunConfig
 from mbdpg.experiments.origin import origin
-from mbdpg.experiments.run import OnUpdate, resume, train
+from mbdpg.experiments.resuming import resume
+from mbdpg.experiments.run import OnUpdate, train
 from mbdpg.interfaces import UserError, require
 from mbdpg.reports.record import setting
 from mbdpg.storage.files import DamagedFileError, parse_object, read_checked, replace_durably

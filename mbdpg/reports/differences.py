@@ -46,7 +46,9 @@ def machine(config: Mapping[str, Any]) -> str:
     if not parts:
         return "a machine that is not noted"
     cores, system = parts.get("cores"), text(parts.get("platform")).partition("-")[0]
-    return f"{text(parts.get('cpu'))}, {text(cores)} core{'s' * (cores != 1)}, {system}"
+    accelerated = "cpu" not in (devices := text(parts.get("devices", "cpu")))
+    words = [devices] * accelerated + [text(parts.get("cpu")), f"{text(cores)} core{'s' * (cores != 1)}", system]
+    return ", ".join(words)
 
 
 def _flat(config: Mapping[str, Any]) -> dict[str, str]:

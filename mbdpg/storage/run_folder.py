@@ -145,7 +145,7 @@ def discard_unbegun(path: Path) -> None:
 
 
 def describe_machine() -> dict[str, Any]:
-    """Return what decides whether a run repeats bit for bit: processor, cores to use, versions, XLA flags (JSON)."""
+    """What of the host decides whether a run repeats bit for bit: processor, cores to use, versions, XLA flags."""
     return {
         "cpu": _cpu_model(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),

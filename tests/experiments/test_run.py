@@ -13,11 +13,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 
 from mbdpg.agents import td3
-from mbdpg.experiments import run
+from mbdpg.experiments import resuming, run
 from mbdpg.experiments.config import EnvOptions, RunConfig
 from mbdpg.interfaces import EnvSpec, Step, UserError
 from mbdpg.storage import RunFolder
@@ -226,7 +227,13 @@ def toy_run(toys: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run.train(TOY, seeds=[0], out=tmp_path_factory.mktemp("toy"), make_env=Toy)[0]
 
 
-def test_seeds_in_one_process_leave_the_bytes_that_each_leaves_alone(toy_run: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("devices", [1, 2])
+def test_seeds_in_one_process_leave_the_bytes_that_each_leaves_alone(
+    toy_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, devices: int
+) -> None:
+    there = jax.local_devices()[:devices]
+    assert len(there) == devices
+    monkeypatch.setattr(jax, "local_devices", lambda: there)
     first, second = run.train(TOY, seeds=[0, 3], out=tmp_path / "both", make_env=Toy)
     (alone,) = run.train(TOY, seeds=[3], out=tmp_path / "alone", make_env=Toy)
     for found, expected in ((first, toy_run), (second, alone)):
@@ -254,7 +261,7 @@ def test_seeds_that_were_begun_at_once_go_on_at_once_and_leave_the_bytes_of_an_u
         going.append(([path.name for path in runs], env_steps))
         return lambda update: None
 
-    run.resume([tmp_path / "a" / "seed-0", ahead, tmp_path / "a" / "seed-3"], make_env=Toy, watch=watch)
+    resuming.resume([tmp_path / "a" / "seed-0", ahead, tmp_path / "a" / "seed-3"], make_env=Toy, watch=watch)
     (both, begun), alone = going
     assert (both, begun) == (["seed-0", "seed-3"], 30) and alone == (["seed-5"], 40)
     whole = run.train(TOY, seeds=[3], out=tmp_path / "b", make_env=Toy)[0]
@@ -266,6 +273,19 @@ def test_seeds_that_were_begun_at_once_go_on_at_once_and_leave_the_bytes_of_an_u
             for run in (found, expected)
         )
         assert left.keys() == right.keys() and [name for name in left if left[name] != right[name]] == []
+
+
+def test_a_stop_in_one_run_begins_none_of_those_that_would_go_on_after_it(toys: None, tmp_path: Path) -> None:
+    short = dataclasses.replace(TOY, schedule=dataclasses.replace(TOY.schedule, steps=20))
+    first, second = (run.train(one, seeds=[i], out=tmp_path, make_env=Toy)[0] for i, one in enumerate((TOY, short)))
+    going: list[str] = []
+
+    def watch(runs: Any, config: RunConfig, env_steps: int) -> Any:
+        going.extend(path.name for path in runs)
+        return lambda update: None
+
+    resuming.resume([first, second], make_env=Toy, steps=60, watch=watch, should_stop=lambda: bool(going))
+    assert going == ["seed-0"]
 
 
 def edited(source: Path, target: Path, **changes: Any) -> Path:
@@ -288,8 +308,8 @@ def test_a_longer_run_begins_where_the_shorter_ended(toy_run: Path, tmp_path: Pa
     folder = edited(toy_run, tmp_path / "longer")
     before = (folder / "metrics.jsonl").read_bytes()
     with pytest.raises(UserError, match="--steps is 20, but .*longer has 40 behind it; expected at least as many"):
-        run.resume([folder], make_env=Toy, steps=20)
-    run.resume([folder], make_env=Toy, steps=60)
+        resuming.resume([folder], make_env=Toy, steps=20)
+    resuming.resume([folder], make_env=Toy, steps=60)
     assert (folder / "metrics.jsonl").read_bytes().startswith(before)
     assert (folder / "checkpoints" / "000000060").is_dir()
 
@@ -322,7 +342,7 @@ def test_a_changed_config_is_refused_in_one_line(
         file.write('{"kind": "train", "env_steps": 50}\n')
     before = contents(folder)
     with pytest.raises(UserError) as caught:
-        run.resume([folder], make_env=Toy)
+        resuming.resume([folder], make_env=Toy)
     assert said in str(caught.value) and "\n" not in str(caught.value)
     assert "checkpoint does not fit" in said or str(folder) in str(caught.value)
     assert contents(folder) == before
@@ -333,7 +353,7 @@ def test_another_environment_than_the_run_s_is_refused(toy_run: Path, tmp_path: 
         spec = dataclasses.replace(Toy.spec, observation_size=4)
 
     with pytest.raises(UserError, match="does not fit this configuration"):
-        run.resume([edited(toy_run, tmp_path / "run")], make_env=Wider)
+        resuming.resume([edited(toy_run, tmp_path / "run")], make_env=Wider)
 
 
 def test_a_run_folder_never_decides_that_code_is_imported(toy_run: Path, tmp_path: Path, monkeypatch: Any) -> None:
@@ -342,7 +362,7 @@ def test_a_run_folder_never_decides_that_code_is_imported(toy_run: Path, tmp_pat
     options = dataclasses.asdict(EnvOptions(allow_import=True))
     folder = edited(toy_run, tmp_path / "run", env="hostile:Toy-v0", env_options=options, custom_env=False)
     with pytest.raises(UserError, match="would run the code of the module hostile"):
-        run.resume([folder])
+        resuming.resume([folder])
 
 
 def test_a_run_that_could_not_begin_leaves_no_folder(toys: None, tmp_path: Path) -> None:
@@ -376,7 +396,7 @@ def test_an_environment_that_fails_for_good_keeps_the_checkpoint_to_go_on_from(t
     with pytest.raises(UserError, match="failed 10 times in a row .* continue with mbdpg resume"):
         run.train(TOY, seeds=[0], out=tmp_path, make_env=lambda: Toy(fault))
     broken[0] = False
-    run.resume([tmp_path / "seed-0"], make_env=lambda: Toy(fault))
+    resuming.resume([tmp_path / "seed-0"], make_env=lambda: Toy(fault))
     assert (tmp_path / "seed-0" / "checkpoints" / "000000040").is_dir()
 
 
@@ -421,10 +441,10 @@ def test_a_policy_is_refused_where_it_does_not_fit(toy_run: Path, tmp_path: Path
 
 def test_a_resume_on_another_machine_says_what_changed(toy_run: Path, tmp_path: Path, capsys: Any) -> None:
     machine = RunFolder.open(toy_run).config["machine"]
-    other = machine | {"cpu": "abacus", "versions": machine["versions"] | {"jax": "0.0.1"}}
-    run.resume([edited(toy_run, tmp_path / "other", machine=other)], make_env=Toy)
-    assert "other was begun with another cpu, jax; its results may differ" in capsys.readouterr().err
-    run.resume([edited(toy_run, tmp_path / "same")], make_env=Toy)
+    other = machine | {"cpu": "abacus", "devices": "1 × abacus", "versions": machine["versions"] | {"jax": "0.0.1"}}
+    resuming.resume([edited(toy_run, tmp_path / "other", machine=other)], make_env=Toy)
+    assert "other was begun with another cpu, devices, jax; its results may differ" in capsys.readouterr().err
+    resuming.resume([edited(toy_run, tmp_path / "same")], make_env=Toy)
     assert capsys.readouterr().err == ""
 
 
@@ -435,4 +455,4 @@ def test_what_an_environment_raises_when_it_is_made_is_not_blamed_on_the_checkpo
         raise ValueError("no such track")
 
     with pytest.raises(ValueError, match="no such track"):
-        run.resume([edited(toy_run, tmp_path / "run")], make_env=make)
+        resuming.resume([edited(toy_run, tmp_path / "run")], make_env=make)

@@ -13,7 +13,7 @@ import pytest
 
 from mbdpg.agents import mbdpg
 from mbdpg.envs import episode_seed
-from mbdpg.experiments import run
+from mbdpg.experiments import resuming, run
 from mbdpg.experiments.config import RunConfig
 from mbdpg.imitation.demonstrations import Demonstrations, record
 from mbdpg.interfaces import EnvSpec, Phase, Sampling, Step, UserError
@@ -253,7 +253,7 @@ def test_training_from_demonstrations_clones_first_and_counts_their_cost(toy: An
     file.unlink()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run, "make_agent", make_agent)
-        run.resume([with_them], make_env=Lottery, steps=60)
+        resuming.resume([with_them], make_env=Lottery, steps=60)
     assert rows(with_them)[-1]["env_steps"] == 60
 
 
