@@ -10,9 +10,9 @@ import numpy as np
 from mbdpg import envs
 from mbdpg.dynamics.planning import PlanningPolicy
 from mbdpg.experiments import resuming, run
-from mbdpg.experiments.config import AgentConfig, RunConfig
+from mbdpg.experiments.config import CONFIGS, AgentConfig, RunConfig
 from mbdpg.experiments.presets import agent_config
-from mbdpg.interfaces import Environment
+from mbdpg.interfaces import Environment, require
 from mbdpg.networks.policy import NumpyPolicy
 from mbdpg.training.evaluation import Evaluation, evaluate as run_episodes
 from mbdpg.training.loop import Schedule, Update
@@ -48,7 +48,15 @@ def train(
     Raises:
         UserError: something you can mend, said in one line.
     """
+    made = isinstance(env, str) or callable(env)
+    require(made, f"env is {type(env).__name__}, expected a Gymnasium id or a function that makes an environment")
+    require(not isinstance(seeds, int), f"seeds is {seeds}, expected a list of numbers, as in [{seeds}]")
     agent = agent_config("mbdpg", "default", env if isinstance(env, str) else None) if config is None else config
+    kinds = tuple(CONFIGS.values())
+    given = agent.__name__ if isinstance(agent, type) else type(agent).__name__
+    require(
+        isinstance(agent, kinds), f"config is {given}, expected an MBDPGConfig(...) or a rival's, made by calling it"
+    )
     settings = RunConfig(
         env=env if isinstance(env, str) else _name(env) or "environment made in code",
         agent=agent,

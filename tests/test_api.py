@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -154,3 +155,22 @@ def test_a_callback_that_raises_ends_the_run_which_can_be_gone_on_with(tmp_path:
 def test_everything_public_is_there_and_explained() -> None:
     for name in mbdpg.__all__:
         assert getattr(mbdpg, name).__doc__
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"env": gymnasium.Env()}, "env is Env, expected a Gymnasium id or a function"),
+        ({"seeds": 3}, r"seeds is 3, expected a list of numbers, as in \[3\]"),
+        ({"config": "td3"}, "config is str, expected an MBDPGConfig"),
+        ({"config": mbdpg.TD3Config}, "config is Config, expected an MBDPGConfig"),
+    ],
+    ids=["an environment made already", "one seed", "an algorithm's name", "a class"],
+)
+def test_what_is_no_environment_list_or_config_is_refused_in_one_line(
+    tmp_path: Path, changes: dict[str, Any], said: str
+) -> None:
+    given = {"env": "Pendulum-v1", "out": tmp_path} | changes
+    train: Any = inspect.unwrap(mbdpg.train)  # without the types' check, which only tests have
+    with pytest.raises(mbdpg.UserError, match=said):
+        train(**given)

@@ -88,7 +88,7 @@ def _resume(args: list[str]) -> None:
     keep_compilations()
     runs = [flags.run]
     if flags.run.is_dir() and not (flags.run / "config.json").exists():
-        runs = sorted(path.parent for path in flags.run.glob("seed-*/config.json")) or runs
+        runs = sorted(path.parent for path in flags.run.glob("*/config.json")) or runs
     with Stop() as stop:
         with contextlib.ExitStack() as displays:
 

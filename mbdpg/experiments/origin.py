@@ -10,16 +10,17 @@ from typing import Any
 import jax
 
 from mbdpg.storage.run_folder import describe_machine
+from mbdpg.training.learner import seed_mesh
 
 
-def origin() -> dict[str, Any]:
-    """Commit and machine of this process (JSON), as a run's config and the note beside a file record them."""
-    return {"commit": _commit(), "machine": machine()}
+def origin(seeds: int = 1) -> dict[str, Any]:
+    """Commit and machine (JSON), as the config of runs of so many seeds and the note beside a file record them."""
+    return {"commit": _commit(), "machine": machine(seeds)}
 
 
-def machine() -> dict[str, Any]:
-    """What decides whether a run repeats bit for bit: that of the host, and the devices that JAX computes on (JSON)."""
-    kinds = Counter(device.device_kind for device in jax.local_devices())
+def machine(seeds: int = 1) -> dict[str, Any]:
+    """What decides whether runs repeat bit for bit: the host, and the devices that share their seeds (JSON)."""
+    kinds = Counter(device.device_kind for device in seed_mesh(seeds, jax.local_devices()).devices.flat)
     return describe_machine() | {"devices": ", ".join(f"{count} × {kind}" for kind, count in sorted(kinds.items()))}
 
 

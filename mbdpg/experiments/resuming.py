@@ -110,7 +110,7 @@ def _go_on(
         with _as_written_by_us(paths, checkpoints[0].env_steps):
             training = compose(config, spec, make, seeds, recorders, stack, None, checkpoints)
         for s in group:
-            _say_what_changed(s.folder.path, s.folder.config.get("machine"))
+            _say_what_changed(s.folder.path, s.folder.config.get("machine"), machine(len(group)))
         training.run(watch(paths, config, training.env_steps), should_stop)
 
 
@@ -126,15 +126,18 @@ def _as_written_by_us(runs: Sequence[Path], env_steps: int) -> Iterator[None]:
         ) from error
 
 
-def _say_what_changed(path: Path, recorded: Any) -> None:
+def _say_what_changed(path: Path, recorded: Any, now: dict[str, Any]) -> None:
     """A resume repeats bytes only on the same processor, cores and versions: say what is another one now."""
     before: dict[str, Any] = recorded if isinstance(recorded, dict) else {}
-    versions, now = before.get("versions"), machine()
+    versions = before.get("versions")
     versions = versions if isinstance(versions, dict) else {}
     changed = [name for name in ("cpu", "cores", "devices", "python", "XLA_FLAGS") if before.get(name) != now[name]]
     changed += [name for name, version in now["versions"].items() if versions.get(name) != version]
     if changed:
-        print(f"mbdpg: {path} was begun with another {', '.join(changed)}; its results may differ", file=sys.stderr)
+        print(
+            f"mbdpg: {path} was begun elsewhere, with other {', '.join(changed)}; its results may differ",
+            file=sys.stderr,
+        )
 
 
 def _seed_of(folder: RunFolder) -> int:

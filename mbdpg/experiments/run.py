@@ -59,7 +59,7 @@ def train(
     make = make_env or config.make_env
     spec = spec_of(make)
     demonstrations = Demonstrations.load(Path(config.demonstrations), spec) if config.demonstrations else None
-    description = config.to_json() | origin()
+    description = config.to_json() | origin(len(seeds))
     folders: list[RunFolder] = []
     with contextlib.ExitStack() as undo, contextlib.ExitStack() as stack:
         for seed in seeds:

@@ -111,8 +111,22 @@ def compare(groups: Mapping[str, Sequence[Record]], *, at: int | None = None) ->
         step, notes = shared[-1], _held_back(every, shared[-1])
     else:
         step, notes = at, _without(every, at)
+    notes += [note for label, own in groups.items() for note in _repeated(label, own)]
     points = {label: [(step, curve[step]) for curve in own if step in curve] for label, own in curves.items()}
     return Comparison(_rows({label: own for label, own in points.items() if own}), notes)
+
+
+def _repeated(label: str, runs: Sequence[Record]) -> list[str]:
+    """Which seeds a group has more than once: their runs are the same and no further evidence."""
+    by_seed: dict[int, list[str]] = defaultdict(list)
+    for run in runs:
+        if isinstance(seed := run.config.get("seed"), int):
+            by_seed[seed].append(run.name)
+    several = {seed: names for seed, names in by_seed.items() if len(names) > 1}
+    return [
+        f"seed {seed} counts {len(names)} times in {label}, which makes intervals too narrow: {', '.join(names)}"
+        for seed, names in several.items()
+    ]
 
 
 def _held_back(curves: Mapping[str, Curve], step: int) -> list[str]:

@@ -63,14 +63,16 @@ def _hours(panel: Curves) -> Table:
 
 
 def _errors(panel: Errors) -> Table:
-    """Each model's errors, and persistence's at the last step."""
+    """Each model's errors, and persistence's."""
     found = panel.tables()
     depths = [depth for depth in DEPTHS if all(depth <= errors.shape[1] for errors in found.values())]
-    table = [["error after", "seeds", *(f"{depth} step{'s' * (depth > 1)}" for depth in depths), "no change at all"]]
+    table = [["error (standard deviations) after", "seeds", *(f"{depth} step{'s' * (depth > 1)}" for depth in depths)]]
     for label, errors in found.items():
         mean, spread = errors[:, :, 1].mean(axis=0), errors[:, :, 1].std(axis=0, ddof=1 if len(errors) > 1 else 0)
         parts = [f"{mean[i - 1]:.3f}" + f" ± {spread[i - 1]:.3f}" * (len(errors) > 1) for i in depths]
-        table.append([label, str(len(errors)), *parts, f"{errors[:, -1, 2].mean():.3f}"])
+        table.append([label, str(len(errors)), *parts])
+    for errors in [*found.values()][:1]:  # the same for all, on the same steps
+        table.append(["no change at all", "", *(f"{errors[:, i - 1, 2].mean():.3f}" for i in depths)])
     return table
 
 

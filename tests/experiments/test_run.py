@@ -443,7 +443,7 @@ def test_a_resume_on_another_machine_says_what_changed(toy_run: Path, tmp_path: 
     machine = RunFolder.open(toy_run).config["machine"]
     other = machine | {"cpu": "abacus", "devices": "1 × abacus", "versions": machine["versions"] | {"jax": "0.0.1"}}
     resuming.resume([edited(toy_run, tmp_path / "other", machine=other)], make_env=Toy)
-    assert "other was begun with another cpu, devices, jax; its results may differ" in capsys.readouterr().err
+    assert "other was begun elsewhere, with other cpu, devices, jax; its results may differ" in capsys.readouterr().err
     resuming.resume([edited(toy_run, tmp_path / "same")], make_env=Toy)
     assert capsys.readouterr().err == ""
 

@@ -1,5 +1,6 @@
 """Made-up run folders."""
 
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,10 @@ def make() -> Callable[..., Path]:
     return make_run
 
 
+SEEDS = itertools.count()
+"""Each run has its own."""
+
+
 def make_run(
     path: Path,
     returns: dict[int, float | None],
@@ -29,7 +34,8 @@ def make_run(
 ) -> Path:
     """A run folder with these returns, these settings, and more values in the rows of these steps."""
     default = {"env": env, "algorithm": algorithm, "agent": {"width": 8, "discount": 0.9} | agent, "env_options": {}}
-    RunFolder.create(path, default | {"demonstrations": None, "seed": 0} | (config or {}))
+    seed = next(SEEDS)
+    RunFolder.create(path, default | {"demonstrations": None, "seed": seed} | (config or {}))
     with MetricsLog(path) as log:
         for step, value in returns.items():
             row = {} if value is None else {"eval/return_mean": value}

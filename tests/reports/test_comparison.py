@@ -97,6 +97,15 @@ def test_a_run_too_short_for_at_costs_the_others_nothing(tmp_path: Path, make: M
         check_step(runs, 30)
 
 
+def test_a_seed_that_counts_twice_is_named(tmp_path: Path, make: Make) -> None:
+    for name, seed in (("a0", 0), ("a1", 1), ("a2", 0)):
+        make(tmp_path / name, {0: 0.0, 100: 1.0}, config={"seed": seed})
+    runs = [run for own in records(tmp_path).values() for run in own]
+    (note,) = compare({"a": runs}).notes
+    assert note == "seed 0 counts 2 times in a, which makes intervals too narrow: a0, a2"
+    assert compare({"a": runs[:2]}).notes == []
+
+
 def test_a_run_that_has_just_begun_is_named_where_it_pulls_the_comparison_down(tmp_path: Path, make: Make) -> None:
     make(tmp_path / "a", dict.fromkeys((0, 100, 1000), 1.0))
     make(tmp_path / "b", dict.fromkeys((0, 100), 1.0))

@@ -53,8 +53,9 @@ def test_a_figure_has_its_numbers_beside_it(tmp_path: Path) -> None:
     panels = [Errors("models", {"mixture": {file: {} for file in fits}}), Curves("E-v0", {"td3": td3, "sac": sac})]
     lines = write_figure("figure-x", panels, tmp_path)
     assert rows_in(lines) == [
-        ["error after", "seeds", "1 step", "10 steps", "50 steps", "200 steps", "no change at all"],
-        ["mixture", "2", "1.500 ± 0.707", "15.000 ± 7.071", "75.000 ± 35.355", "300.000 ± 141.421", "5.000"],
+        ["error (standard deviations) after", "seeds", "1 step", "10 steps", "50 steps", "200 steps"],
+        ["mixture", "2", "1.500 ± 0.707", "15.000 ± 7.071", "75.000 ± 35.355", "300.000 ± 141.421"],
+        ["no change at all", "", "5.000", "5.000", "5.000", "5.000"],
         ["", "seeds", "steps", "return", "std", "interquartile mean", "95 % interval", "hours"],
         ["td3", "2", "20", "99.0", "0.0", "99.0", "99.0 to 99.0", ""],
         ["sac", "1", "10", "1.0", "", "", "", ""],
