@@ -23,9 +23,9 @@ def elu(x: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def matrix_product(
-    x: Float[Array, "*batch inputs"], weight: Float[Array, "inputs outputs"]
+    x: Float[Array, "*batch inputs"], weight: Float[Array, "*stack inputs outputs"]
 ) -> Float[Array, "*batch outputs"]:
-    """Matrix product of float32, forwards and backwards, on every device.
+    """Product with one matrix or a stack of them, of float32 forwards and backwards on every device.
 
     A GPU's default rounds what it multiplies to ten bits, and imagination feeds errors back.
     """
