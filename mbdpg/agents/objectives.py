@@ -11,11 +11,17 @@ from jaxtyping import Array, Float
 from mbdpg.interfaces import Metrics
 
 RewardWeights = Literal["uniform", "remaining"]
+ActorValue = Literal["clipped", "mean"]
 
 
 def clipped_value(values: Float[Array, "critic *batch"]) -> Float[Array, "*batch"]:
     """Q = min_i Q_i (Eq. 17), for targets and for the actor; each critic is regressed by itself."""
     return jnp.min(values, axis=0)
+
+
+def climbed_value(values: Float[Array, "critic *batch"], actor_value: ActorValue) -> Float[Array, "*batch"]:
+    """What the actor climbs: the clipped value, or the critics' mean, as in REDQ (Chen et al. 2021)."""
+    return clipped_value(values) if actor_value == "clipped" else jnp.mean(values, axis=0)
 
 
 def temporal_difference_target(

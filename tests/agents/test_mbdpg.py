@@ -278,6 +278,17 @@ def test_without_terminal_values_the_actor_does_not_see_the_critics(differences:
         assert ("actor" in differences(once, other)) == matters
 
 
+@pytest.mark.parametrize(("actor_value", "reduced"), [("clipped", np.min), ("mean", np.mean)])
+def test_the_actor_climbs_the_value_that_it_is_told_to(actor_value: str, reduced: Callable[..., np.ndarray]) -> None:
+    """Without a horizon J is the value of its own action, and nothing else."""
+    one = agent((("horizon", 0), ("actor_value", actor_value)))
+    window = state().window(jax.tree.map(jnp.asarray, BATCHES["improve"]))
+    start = one._start(state(), window, key=jax.random.key(0))
+    _, (_, metrics) = one._actor_loss(state().actor, state(), start, jax.random.key(0))
+    values = state().critics(start.observation, state().actor(start.observation))
+    np.testing.assert_allclose(metrics["actor/objective"], np.mean(reduced(values, axis=0)), rtol=1e-5)
+
+
 def test_targets_wait_for_the_third_update_where_c_is_3(differences: Callable[..., set[str]]) -> None:
     step = update("improve", tuple(PAPER.items()))
     states = [state()]

@@ -235,7 +235,7 @@ class MBDPG:
         )
         seen = imagined.observations[c.first_value :]
         seen = jax.lax.stop_gradient(seen) if printed else seen
-        values = objectives.clipped_value(state.critics(seen, imagined.actions[c.first_value :]))
+        values = objectives.climbed_value(state.critics(seen, imagined.actions[c.first_value :]), c.actor_value)
         values = values if c.terminal_value else jnp.zeros_like(values)
         survival = imagined.survival()
         survival = jax.lax.stop_gradient(survival) if printed else survival

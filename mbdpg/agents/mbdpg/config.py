@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from mbdpg.agents.objectives import RewardWeights
+from mbdpg.agents.objectives import ActorValue, RewardWeights
 from mbdpg.dynamics.fitting import Likelihood
 from mbdpg.interfaces import require, require_settings
 
@@ -46,6 +46,8 @@ class Config:
     """Imagined step at which the value terms of Eq. 18 begin: 1 as printed, 0 to teach the first action by Q too."""
     terminal_value: bool = True
     """Whether the actor climbs values (Eq. 18) or, as in Fig. 9c, the imagined rewards alone."""
+    actor_value: ActorValue = "clipped"
+    """What the actor climbs: the lesser of both critics' values (Eq. 17), or their mean, which fears less."""
     trace: float = 0.5
     """Lambda of the value expansion: 1 is Eq. 16, 0 one-step targets, in between longer expansions count less."""
     imagined_weight: float = 0.5

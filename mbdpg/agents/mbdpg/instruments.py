@@ -64,14 +64,14 @@ def measure(config: Config, state: State, window: Window, realized_return: Float
 
 
 def _gradient_norm(config: Config, state: State, start: Array, memory: Memory, depth: int) -> Array:
-    """Norm of the derivative of E[Q(s_t, a_t)], t = depth, with respect to the actor's parameters."""
+    """Norm of the derivative of E[Q(s_t, a_t)], t = depth, Q as the actor climbs it, by the actor's parameters."""
     printed = config.gradient == "eq19"
 
     def value(actor: Policy) -> Array:
         imagined = _imagine(state, actor, start, memory, depth=depth, printed=printed)
         seen = imagined.observations[-1]
         seen = jax.lax.stop_gradient(seen) if printed else seen
-        return jnp.mean(objectives.clipped_value(state.critics(seen, imagined.actions[-1])))
+        return jnp.mean(objectives.climbed_value(state.critics(seen, imagined.actions[-1]), config.actor_value))
 
     return optax.tree.norm(jax.grad(value)(state.actor))
 
