@@ -142,7 +142,11 @@ def _benchmark(args: list[str]) -> None:
     if file is not None:
         fits = os.access(file.absolute().parent, os.W_OK) and not file.is_dir()
         require(fits, f"--json is {file}, expected a file in a folder that can be written to")
-    measured = benchmark.benchmark(lambda line: print(line, flush=True), growth=not flags.quick)
+
+    def show(what: str, value: str, remark: str) -> None:
+        print(f"{what:<28} {value:>14}  {remark}".rstrip(), flush=True)
+
+    measured = benchmark.benchmark(show, growth=not flags.quick)
     if file is not None:
         replace_durably(file, json.dumps(measured, indent=2).encode())
         print(f"all numbers in {file}")

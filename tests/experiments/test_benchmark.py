@@ -89,11 +89,13 @@ def test_everything_is_measured_and_written(
     numbers = json.loads((tmp_path / "numbers.json").read_text())
     for name in ("improve_ms", "improve_gflop", "fit_ms", "fit_gflop", "attainable_gflops", "policy_us"):
         assert numbers[name] > 0, name
-    for name in ("improve", "fit"):
+    for name in ("improve", "fit", "ground"):
         rate = numbers[f"{name}_gflop"] / (numbers[f"{name}_ms"] * 1e-3)
         assert 0 < numbers[f"{name}_share"] < 1.5
         np.testing.assert_allclose(rate / numbers[f"{name}_attainable_gflops"], numbers[f"{name}_share"], rtol=1e-6)
     assert 0 < numbers["warm_start_s"] < numbers["cold_start_s"] and numbers["peak_memory_mb"] > 100
     assert numbers["growth_ms"]["seeds"]["improving"]["2"] > 0 and numbers["growth_ms"]["seeds"]["fitting"]["2"] > 0
-    said = capsys.readouterr().out
-    assert "improve: " in said and "GFLOP/s" in said and "peak memory with 3,000 steps" in said
+    rows = capsys.readouterr().out.splitlines()
+    for number, unit in (("improve_ms", "ms"), ("ground_ms", "ms"), ("cold_start_s", "s"), ("policy_us", "us")):
+        assert any(f" {numbers[number]:.1f} {unit}  " in row for row in rows), number
+    assert any(row.startswith("peak memory ") and "3,000 steps" in row for row in rows)
