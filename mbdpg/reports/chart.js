@@ -71,9 +71,12 @@ function smooth(values, weight) {
 
 // ── From runs to points ──────────────────────────────────────────────────────────────────────────────────────────────
 
-/** Points {step, x, y} of each run of a group that has the series; y is null in a gap. */
-function runPoints(group, series, state) {
-  return group.runs.filter((run) => run.series[series]).map((run) => {
+/** What the state calls a run of the environment's group with this index, when it is hidden. */
+const runKey = (group, run) => `${group}/${run.name}`;
+
+/** Points {step, x, y} of each run of a group that has the series and is shown; y is null in a gap. */
+function runPoints(group, index, series, state) {
+  return group.runs.filter((run) => run.series[series] && !state.hidden.has(runKey(index, run))).map((run) => {
     const values = smooth(run.series[series], state.smoothing);
     return values.map((y, index) => ({ step: run.axes.steps[index], x: run.axes[state.axis][index], y }))
       .filter((point) => known(point.x));
@@ -106,7 +109,7 @@ function chartOf(chart, environment, state, height) {
 
   function draw() {
     const visible = environment.groups.flatMap((group, index) => (state.hidden.has(index) ? [] : chart.lines.map((line, second) => {
-      const runs = runPoints(group, line.series, state);
+      const runs = runPoints(group, index, line.series, state);
       return { index, label: group.label, line, second, runs, mean: meanPoints(runs) };
     })));
     const scales = scalesOf(visible.flatMap((one) => one.runs.flat()), chart, plot.clientWidth, height, state.axis);

@@ -39,6 +39,11 @@ _CRITIC = Chart(
     "mean over evaluated states, discounted",
     [Line("value", "value"), Line("realized", "realized")],
 )
+_RETURN_AHEAD = Chart(
+    "Return of 20 steps",
+    "mean over evaluated states, discounted",
+    [Line("return_imagined", "imagined"), Line("return_observed", "observed")],
+)
 _SURVIVAL = Chart(
     "Survival over 20 steps",
     "probability",
@@ -55,6 +60,8 @@ def series_of(run: Record) -> dict[str, Values]:
         "return": run.column("eval/return_mean"),
         "value": _combined(run.column("critic/q_bias"), realized, lambda bias, paid: bias + paid),
         "realized": realized,
+        "return_imagined": run.column("dynamics/return_imagined"),
+        "return_observed": run.column("dynamics/return_observed"),
         "survival_imagined": run.column("dynamics/survival_imagined"),
         "survival_observed": run.column("dynamics/survival_observed"),
         "reward_bias": run.column("dynamics/reward_bias"),
@@ -75,8 +82,8 @@ def diagnostics(names: Iterable[str]) -> list[Chart]:
     known = set(names)
     depths = sorted(int(name.removeprefix("error_")) for name in known if name.startswith("error_"))
     errors = [_error(depth) for depth in depths]
-    rest = [chart for chart in (_CRITIC, _SURVIVAL, _REWARD, _RANGE) if known & {line.series for line in chart.lines}]
-    return errors + rest
+    rest = (_CRITIC, _RETURN_AHEAD, _SURVIVAL, _REWARD, _RANGE)
+    return errors + [chart for chart in rest if known & {line.series for line in chart.lines}]
 
 
 def _error(depth: int) -> Chart:

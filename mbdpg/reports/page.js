@@ -43,12 +43,21 @@ function smoothingSlider(state, draw) {
 }
 
 function legend(environment, state, draw) {
-  return element("div", { class: "legend", role: "group", "aria-label": "groups shown" }, ...environment.groups.map((group, index) =>
-    button([swatch(index), element("span", {}, group.label), element("span", { class: "muted" }, plural(group.runs.length, "run"))], true, (node) => {
-      if (!state.hidden.delete(index)) state.hidden.add(index);
-      node.setAttribute("aria-pressed", !state.hidden.has(index));
-      draw();
-    })));
+  const toggle = (key, ...content) => button(content, true, (node) => {
+    if (!state.hidden.delete(key)) state.hidden.add(key);
+    node.setAttribute("aria-pressed", !state.hidden.has(key));
+    draw();
+  });
+  const groups = environment.groups.map((group, index) => toggle(
+    index, swatch(index), element("span", {}, group.label), element("span", { class: "muted" }, plural(group.runs.length, "run"))));
+  const runs = environment.groups.flatMap((group, index) => (group.runs.length < 2 ? [] : group.runs.map((run) => toggle(
+    runKey(index, run), swatch(index), element("span", {}, run.name)))));
+  return [
+    element("div", { class: "legend", role: "group", "aria-label": "groups shown" }, ...groups),
+    ...(runs.length ? [element("details", { class: "runs" },
+      element("summary", { class: "muted" }, "single runs; a mean is over those shown"),
+      element("div", { class: "legend", role: "group", "aria-label": "runs shown" }, ...runs))] : []),
+  ];
 }
 
 function table(content, groups) {
@@ -87,7 +96,7 @@ function section(environment) {
   const node = element("section", {},
     element("h2", {}, environment.name),
     element("div", { class: "controls" }, axisSwitch(environment, state, draw), smoothingSlider(state, draw)),
-    legend(environment, state, draw), main, axisTitle,
+    ...legend(environment, state, draw), main, axisTitle,
     ...environment.notes.map((note) => element("p", { class: "note" }, note)),
     ...environment.scores.flatMap((scores) => titled(scores, environment.groups)),
     ...titled(environment.problems, environment.groups), ...titled(environment.clock, environment.groups),

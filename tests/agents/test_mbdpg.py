@@ -473,6 +473,8 @@ def test_the_instruments_are_finite_and_named_as_documented() -> None:
         "dynamics/survival_observed",
         "dynamics/out_of_range",
         "dynamics/reward_bias",
+        "dynamics/return_imagined",
+        "dynamics/return_observed",
     }
     names |= {"critic/q_bias", "critic/realized_return", "actor/grad_norm_k01"}
     assert set(metrics) == names
@@ -490,3 +492,22 @@ def test_the_instruments_are_finite_and_named_as_documented() -> None:
         axis=0,
     )
     assert float(metrics["critic/q_bias"]) == pytest.approx(2.0 * float(value[0] + value[2]) / 2 - 1.5, rel=1e-3)
+
+
+def test_returns_of_twenty_steps_leave_out_what_a_time_limit_cuts() -> None:
+    """One window whole, one ended, one cut: the cut one's rewards count in neither return."""
+    one = agent((("discount", 0.9),))
+    length = one.diagnosis.burn_in + one.diagnosis.length
+    end, cut = BURN_IN + 4, BURN_IN + 7
+    windows = edited(batch(length, 3), valid=((1, slice(end, None)), 0), terminated=((1, end - 1), 1))
+    windows = edited(windows, valid=((2, slice(cut, None)), 0))
+    found, other = (
+        one.diagnose(state(), jax.tree.map(jnp.asarray, edited(windows, reward=((2, cut - 1), paid))), jnp.zeros(3))
+        for paid in (1.0, 50.0)
+    )
+    powers = 0.9 ** np.arange(20)
+    rewards = np.asarray(windows.reward)[:, BURN_IN:]
+    expected = (rewards[0] @ powers + rewards[1, :4] @ powers[:4]) / 2
+    np.testing.assert_allclose(found["dynamics/return_observed"], expected, rtol=1e-4)
+    assert found["dynamics/return_observed"] == other["dynamics/return_observed"]
+    assert found["dynamics/return_imagined"] == other["dynamics/return_imagined"] != 0

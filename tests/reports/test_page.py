@@ -103,6 +103,7 @@ def test_wall_clock_is_compared_with_td3_at_the_same_step(tmp_path: Path, make: 
 
 def test_diagnostics_are_there_for_what_was_recorded(tmp_path: Path, make: Make) -> None:
     row = {"dynamics/rmse_k05": 1.0, "dynamics/persistence_k05": 4.0, "dynamics/reward_bias": -0.5}
+    row |= {"dynamics/return_imagined": 3.0, "dynamics/return_observed": 2.5}
     row |= {"critic/q_bias": -2.0, "critic/realized_return": 10.0, "dynamics/survival_observed": 1.0}
     zero = {"dynamics/rmse_k05": 1.0, "dynamics/persistence_k05": 0.0, "dynamics/rmse_k20": "odd"}
     run = make(tmp_path / "a", {0: 1.0, 10: 1.0}, evaluations={0: row, 10: zero})
@@ -113,12 +114,15 @@ def test_diagnostics_are_there_for_what_was_recorded(tmp_path: Path, make: Make)
         "reward_bias": [-0.5, None],
         "value": [8.0, None],
         "realized": [10.0, None],
+        "return_imagined": [3.0, None],
+        "return_observed": [2.5, None],
         "survival_observed": [1.0, None],
     }
     assert [chart["title"] for chart in own["charts"]] == [
         "Mean evaluation return",
         "Model error 5 steps ahead",
         "Critic's value and realized return",
+        "Return of 20 steps",
         "Survival over 20 steps",
         "Reward bias",
     ]

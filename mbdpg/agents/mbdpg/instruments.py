@@ -40,17 +40,26 @@ def measure(config: Config, state: State, window: Window, realized_return: Float
     now = window.observation[:, config.burn_in]
     value = objectives.clipped_value(state.critics(now, window.action[:, config.burn_in])) * state.return_scale
     imagined = _imagine(state, state.average_actor, now, memory, depth=max(DEPTHS), printed=False)
-    few = slice(config.burn_in, config.burn_in + NEAR)
-    paid = window.reward[:, few] * state.scales.reward + window.terminal_reward[:, few] * state.scales.terminal_reward
-    exists = window.valid[:, few]
-    excess = jnp.sum((imagined.rewards[:NEAR].T - paid) * exists) / jnp.sum(exists)
-    ended = jnp.max(window.terminated[:, config.burn_in :] * window.valid[:, config.burn_in :], axis=1)
+    steps = slice(config.burn_in, None)
+    paid = (
+        window.reward[:, steps] * state.scales.reward + window.terminal_reward[:, steps] * state.scales.terminal_reward
+    )
+    exists = window.valid[:, steps]
+    near = exists[:, :NEAR]
+    excess = jnp.sum((imagined.rewards[:NEAR].T - paid[:, :NEAR]) * near) / jnp.sum(near)
+    ended = jnp.max(window.terminated[:, steps] * exists, axis=1)
+    discounts = config.discount ** jnp.arange(max(DEPTHS), dtype=jnp.float32)
+    whole = jnp.maximum(ended, exists[:, -1])  # a time limit cuts the others
+    count = jnp.maximum(jnp.sum(whole), 1.0)
+    expected = imagined.rewards * imagined.survival()[:-1]
     errors = open_loop_error(state.average_dynamics, state.scales, window, burn_in=config.burn_in)
     return (
         error_metrics(errors)
         | objectives.value_bias(value, realized_return)
         | {
             "dynamics/reward_bias": excess * state.return_scale,
+            "dynamics/return_imagined": jnp.sum((discounts @ expected) * whole) / count * state.return_scale,
+            "dynamics/return_observed": jnp.sum(((paid * exists) @ discounts) * whole) / count * state.return_scale,
             "dynamics/survival_imagined": jnp.mean(imagined.survival()[-1]),
             "dynamics/survival_observed": 1.0 - jnp.mean(ended),
             "dynamics/out_of_range": jnp.mean(jnp.abs(imagined.observations[1:]) > OUTLYING),
