@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import csv
 import dataclasses
 import json
 import socket
@@ -14,12 +15,17 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from mbdpg.agents import td3
+from mbdpg.experiments import reproduce as module
 from mbdpg.experiments.config import RunConfig
 from mbdpg.experiments.launch import Local, Ray, launch
-from mbdpg.experiments.reproduce import Training
+from mbdpg.experiments.reproduce import Training, reproduce
+from mbdpg.experiments.search import Search
+from mbdpg.experiments.studies import Cell, Panel, Study
+from mbdpg.experiments.sweep import LAST, Trial, sweep
 from mbdpg.interfaces import UserError
 from mbdpg.training.loop import Schedule
 
@@ -31,41 +37,46 @@ SCHEDULE = Schedule(
 CONFIG = RunConfig("Pendulum-v1", td3.Config(width=8, batch_size=8, random_steps=100, updates_per_step=0.1), SCHEDULE)
 
 
-@pytest.fixture(scope="module")
-def cluster() -> Iterator[str]:
-    """The address of a head and a worker node on loopback, with a core each; other clusters are left alone.
+@contextlib.contextmanager
+def started(*nodes: tuple[str, ...]) -> Iterator[str]:
+    """The address of a cluster of such nodes on loopback, with a core each; other clusters are left alone.
 
     Without tokens: Ray's nodes would ask for one where an earlier cluster left it in the home folder, and its clients
     not bring it.
     """
     ray = str(Path(sys.executable).parent / "ray")
-    node = ("--block", "--node-ip-address=127.0.0.1", "--num-cpus=1", "--disable-usage-stats")
+    common = ("--block", "--node-ip-address=127.0.0.1", "--num-cpus=1", "--disable-usage-stats")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     address = f"127.0.0.1:{port}"
     # Not pytest's own folder: the names of sockets may not be long.
-    with tempfile.TemporaryDirectory() as place, contextlib.ExitStack() as nodes, pytest.MonkeyPatch.context() as patch:
+    with tempfile.TemporaryDirectory() as place, contextlib.ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_AUTH_MODE", "disabled")
-        begun = (
-            ("--head", f"--port={port}", "--include-dashboard=false", f"--temp-dir={place}"),
-            (f"--address={address}",),
-        )
-        for flags in begun:
+        head = ("--head", f"--port={port}", "--include-dashboard=false", f"--temp-dir={place}")
+        for number, flags in enumerate(nodes):
+            joining = head if number == 0 else (f"--address={address}",)
             process = subprocess.Popen(
-                [ray, "start", *flags, *node], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+                [ray, "start", *joining, *common, *flags], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
             )
-            nodes.callback(process.wait, 60)
-            nodes.callback(process.terminate)
-        yield wait_for(address)
+            stack.callback(process.wait, 60)
+            stack.callback(process.terminate)
+        yield wait_for(address, len(nodes))
 
 
-def wait_for(address: str) -> str:
-    """The address, once two nodes have joined."""
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[str]:
+    """A head and a worker node."""
+    with started((), ()) as address:
+        yield address
+
+
+def wait_for(address: str, nodes: int) -> str:
+    """The address, once so many nodes have joined."""
     state = "import ray, sys; ray.init(sys.argv[1], log_to_driver=False); print(len(ray.nodes()))"
     for _ in range(20):
         done = subprocess.run([sys.executable, "-c", state, address], capture_output=True, text=True, check=False)
-        if done.stdout.strip().endswith("2"):
+        if done.stdout.strip().endswith(str(nodes)):
             return address
         time.sleep(1)
     raise AssertionError(done.stdout + done.stderr)
@@ -127,3 +138,39 @@ def test_no_gpus_and_no_cluster_are_said_in_one_line(cluster: str, tmp_path: Pat
         launch([work("a")], Ray(cluster, gpus=True), logs=tmp_path, say=lambda line: None)
     with pytest.raises(UserError, match="--address is 127.0.0.1:1, where nothing answers"):
         launch([work("b")], Ray("127.0.0.1:1"), logs=tmp_path, say=lambda line: None)
+
+
+def test_seeds_of_a_task_and_algorithm_share_a_gpu_and_one_process(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A GPU that is only said to be there: Ray hands it out, and JAX, which finds none, takes the processor."""
+    short = dataclasses.replace(CONFIG, schedule=dataclasses.replace(SCHEDULE, steps=500))
+    monkeypatch.setattr(
+        module, "study", lambda name, scale: Study(name, "nothing", (Panel("alone", (Cell("td3", short),)),))
+    )
+    said: list[str] = []
+    with started(("--num-gpus=1",)) as address:
+        reproduce("figure-8", "quick", tmp_path, Ray(address, gpus=True), seeds=(0, 1), say=said.append)
+    assert [path.name for path in (tmp_path / "logs").iterdir()] == ["Pendulum-v1-td3-seed-0-1.log"]
+    assert "figure-8: 1 of 1 to do" in said
+    for seed in (0, 1):
+        alone = Training(short, (seed,), tmp_path / "alone")
+        alone(lambda: False)
+        assert rows(tmp_path / "Pendulum-v1" / "td3" / f"seed-{seed}") == rows(alone.runs()[0])
+
+
+def test_a_sweep_ends_each_trial_once_though_a_worker_is_killed(
+    cluster: str, kill_in_the_middle: Any, tmp_path: Path
+) -> None:
+    searches, said = (Search("batch_size", 2, 9),), list[str]()
+    first = Trial(0, CONFIG, searches, (0,), False, tmp_path)
+    killed = kill_in_the_middle(first.folder / "seed-0", 500)
+    sweep(CONFIG, searches, trials=3, seeds=(0,), prune=False, out=tmp_path, engine=Ray(cluster), say=said.append)
+    assert killed and "3 of 3 trials completed" in " ".join(said)
+    with open(tmp_path / "sweep.csv", newline="") as file:
+        table = list(csv.DictReader(file))
+    assert [row["state"] for row in table] == ["complete"] * 3 and (tmp_path / "history.png").exists()
+    for number, row in enumerate(table):
+        run = dataclasses.replace(first, number=number).folder / "seed-0"
+        ends = [row["eval/return_mean"] for row in rows(run) if row["kind"] == "eval"]
+        assert len(ends) == 7 and float(row["score"]) == pytest.approx(np.mean(ends[-LAST:]))
