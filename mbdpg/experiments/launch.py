@@ -33,6 +33,8 @@ POLL_SECONDS = 0.5
 ALIVE = "alive"
 """File beside the logs that every process of this machine's holds while it lives."""
 PLATFORM = "JAX_PLATFORMS"
+LOOPBACK = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
+"""0 has Ray listen on loopback alone; else its processes do on all interfaces, whatever address it is given."""
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -254,15 +256,21 @@ def _as_task(work: Work, log: Path, stop_file: Path) -> str | None:
 
 def _connected(address: str | None) -> Any:
     """Ray itself, connected to a cluster or, without an address, to a node begun here."""
+    # Ray reads it as it is imported, and so do the processes that it starts.
+    with _environment({LOOPBACK: "0"} if address is None else {}):
+        return _ray(address)
+
+
+def _ray(address: str | None) -> Any:
     try:
         import ray
     except ImportError as error:
         raise UserError("--engine ray needs Ray, which is not installed: pip install 'mbdpg[ray]'") from error
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    if address is None:  # for this machine alone
+    if address is None:
         address = "local"
-        options |= {"include_dashboard": False, "_node_ip_address": "127.0.0.1"}
+        options |= {"include_dashboard": False}
     elif re.fullmatch(r"[^/]+:[0-9]{1,5}", address):
         host, port = address.rsplit(":", 1)
         try:  # Ray would go on asking for minutes

@@ -174,3 +174,36 @@ def test_a_sweep_ends_each_trial_once_though_a_worker_is_killed(
         run = dataclasses.replace(first, number=number).folder / "seed-0"
         ends = [row["eval/return_mean"] for row in rows(run) if row["kind"] == "eval"]
         assert len(ends) == 7 and float(row["score"]) == pytest.approx(np.mean(ends[-LAST:]))
+
+
+def listening() -> set[tuple[str, int]]:
+    """Addresses, but for loopback, and ports that processes of this machine accept connections at."""
+    found = set()
+    for table in (Path("/proc/net/tcp"), Path("/proc/net/tcp6")):
+        for line in table.read_text().splitlines()[1:] if table.exists() else ():
+            (address, port), state = line.split()[1].split(":"), line.split()[3]
+            loopback = address.endswith("7F") if len(address) == 8 else address.endswith(("01000000", "0100007F"))
+            if state == "0A" and not loopback:
+                found.add((address, int(port, 16)))
+    return found
+
+
+def test_without_an_address_nothing_listens_to_other_machines(tmp_path: Path) -> None:
+    """Every process of Ray's listened on all interfaces, though it was told to be 127.0.0.1."""
+    short = dataclasses.replace(CONFIG, schedule=dataclasses.replace(SCHEDULE, steps=200))
+    work = Training(short, (0,), tmp_path / "Pendulum-v1" / "td3")
+    # In a process that has not imported Ray for a cluster before.
+    code = (
+        "import json, pathlib, sys; from mbdpg.experiments.config import RunConfig; "
+        "from mbdpg.experiments.launch import Ray, launch; from mbdpg.experiments.reproduce import Training; "
+        "config, out = RunConfig.from_json(json.loads(sys.argv[1])), pathlib.Path(sys.argv[2]); "
+        "sys.exit(str(launch([Training(config, (0,), out)], Ray(), logs=out / 'logs', say=print) or ''))"
+    )
+    command = [sys.executable, "-c", code, json.dumps(short.to_json()), str(work.out)]
+    before, during = listening(), set[tuple[str, int]]()
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        while process.poll() is None:
+            during |= listening()
+            time.sleep(0.1)
+        assert process.stderr is not None and process.stderr.read() == "\n"
+    assert work.finished() and during <= before
