@@ -49,7 +49,11 @@ def resume(
     with contextlib.ExitStack() as stack:
         together: dict[str, list[_Saved]] = defaultdict(list)
         for path in runs:
-            saved = _saved(path, stack, make_env is not None, steps, allow_import)
+            try:
+                saved = _saved(path, stack, make_env is not None, steps, allow_import)
+            except UserError as error:
+                way = "none was resumed; move that one away to go on with the others, or resume each by its own folder"
+                raise UserError(f"{error}; {way}" if len(runs) > 1 else str(error)) from error
             together[saved.place].append(saved)
         for group in together.values():
             if not should_stop():

@@ -348,6 +348,15 @@ def test_a_changed_config_is_refused_in_one_line(
     assert contents(folder) == before
 
 
+def test_one_damaged_seed_stops_its_folder_and_the_way_on_is_said(toy_run: Path, tmp_path: Path) -> None:
+    """It was named, and how to go on with the others was not."""
+    whole, damaged = edited(toy_run, tmp_path / "whole"), edited(toy_run, tmp_path / "damaged", agent=None)
+    before = contents(whole)
+    with pytest.raises(UserError, match="damaged cannot .*config.json has no agent.*; none was resumed; move that one"):
+        resuming.resume([whole, damaged], make_env=Toy, steps=60)
+    assert contents(whole) == before
+
+
 def test_another_environment_than_the_run_s_is_refused(toy_run: Path, tmp_path: Path) -> None:
     class Wider(Toy):
         spec = dataclasses.replace(Toy.spec, observation_size=4)
