@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import json
 import os
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -94,6 +95,8 @@ def _resume(args: list[str]) -> None:
 
             def display(going: Sequence[Path], config: RunConfig, env_steps: int) -> RunDisplay:
                 displays.close()  # of those before
+                if len(going) < len(runs):
+                    print(f"going on with {', '.join(map(str, going))}", file=sys.stderr)
                 if env_steps >= config.schedule.steps:
                     for run in going:
                         print(f"{run} has its {env_steps:,} steps already; --steps makes it longer")
