@@ -77,9 +77,11 @@ def test_the_default_preset_is_the_configs_own_defaults() -> None:
 
 def test_a_task_of_its_own_settings_keeps_all_others() -> None:
     own = agent_config("mbdpg", "default", "LunarLanderContinuous-v3")
-    real = mbdpg.Config(horizon=0, grounding_length=32, grounding_batch_size=16, grounding_tolerance=0.6)
+    returns = {"grounding_length": 32, "grounding_batch_size": 16, "grounding_tolerance": 0.6}
+    real = mbdpg.Config(horizon=0, actor_value="mean", **returns)
     assert own == real == agent_config("mbdpg", "default", "LunarLanderContinuous-v2")
-    assert agent_config("mbdpg", "default", "BipedalWalker-v3") == mbdpg.Config()
+    assert agent_config("mbdpg", "default", "BipedalWalker-v3") == mbdpg.Config(grounding_tolerance=1000.0)
+    assert agent_config("mbdpg", "default", "Pendulum-v1") == mbdpg.Config()
     assert agent_config("mbdpg", "default", "Hopper-v5") == mbdpg.Config(planning="stochastic", discount=0.995)
     cheetah = mbdpg.Config(planning="stochastic", discount=0.98)
     assert agent_config("mbdpg", "default", "HalfCheetah-v4") == cheetah
