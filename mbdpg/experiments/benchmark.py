@@ -7,26 +7,23 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 import os
 import resource
 import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from mbdpg.agents import mbdpg
 from mbdpg.experiments.config import RunConfig
 from mbdpg.experiments.origin import machine
+from mbdpg.experiments.products import matrix_products, median_seconds, product_seconds
 from mbdpg.interfaces import Agent, EnvSpec, Phase
-from mbdpg.networks.mlp import matrix_product
 from mbdpg.training.learner import Learner
 from mbdpg.training.replay import Replay
 
@@ -43,22 +40,7 @@ REPLAY_ROWS = 200_000
 """Environment steps of a run whose peak memory is measured."""
 UPDATES = 4
 """Gradient steps per timed call, in one compiled loop as in training."""
-CALLS = 5
 GROWTH = {"horizon": (5, 10, 40), "batch_size": (32, 64, 256), "width": (64, 128, 512), "seeds": (1, 2, 4)}
-
-
-class Product(NamedTuple):
-    """The shape of a matrix product: `batch` times (rows, inner) by (inner, columns)."""
-
-    batch: int
-    rows: int
-    inner: int
-    columns: int
-
-    @property
-    def gflop(self) -> float:
-        """2 operations per multiplication and addition."""
-        return 2e-9 * self.batch * self.rows * self.inner * self.columns
 
 
 class Cost(NamedTuple):
@@ -123,53 +105,8 @@ def cost_of(phase_name: str, config: mbdpg.Config) -> Cost:
     update = jax.make_jaxpr(lambda s, b, k: phase.update(s, b, key=k))(state, batch, jax.random.key(0))
     products = matrix_products(update.jaxpr)
     gflop = sum(product.gflop * count for product, count in products.items())
-    seconds = sum(_product_seconds(product) * count for product, count in products.items())
+    seconds = sum(product_seconds(product) * count for product, count in products.items())
     return Cost(ms, gflop, gflop / seconds)
-
-
-def matrix_products(program: Any) -> Counter[Product]:
-    """Every matrix product that a traced program (a jaxpr) takes, loops counted as often as they go round."""
-    found: Counter[Product] = Counter()
-    for equation in program.eqns:
-        if equation.primitive.name == "dot_general":
-            left, right = (operand.aval.shape for operand in equation.invars)
-            found[_product(left, right, equation.params["dimension_numbers"])] += 1
-        inside = [matrix_products(inner) for inner in _programs(equation.params.values())]
-        if equation.primitive.name == "cond":  # one of them is taken: count the dearest
-            inside = [max(inside, key=lambda products: sum(p.gflop * n for p, n in products.items()))]
-        rounds = equation.params["length"] if equation.primitive.name == "scan" else 1
-        for products in inside:
-            found += Counter({product: rounds * count for product, count in products.items()})
-    return found
-
-
-def _programs(parameters: Iterable[Any]) -> Iterable[Any]:
-    for value in parameters:
-        for item in value if isinstance(value, tuple | list) else (value,):
-            item = getattr(item, "jaxpr", item)
-            if hasattr(item, "eqns"):
-                yield item
-
-
-def _product(left: tuple[int, ...], right: tuple[int, ...], dimensions: Any) -> Product:
-    (contracted, contracted_right), (batched, batched_right) = dimensions
-
-    def size(shape: tuple[int, ...], axes: Iterable[int]) -> int:
-        return math.prod(shape[axis] for axis in axes)
-
-    rows = set(range(len(left))) - {*contracted, *batched}
-    columns = set(range(len(right))) - {*contracted_right, *batched_right}
-    return Product(size(left, batched), size(left, rows), size(left, contracted), size(right, columns))
-
-
-def _product_seconds(product: Product) -> float:
-    """Time of one product, from a compiled loop over as many as take some milliseconds."""
-    repeats = int(np.clip(0.5 / product.gflop, 2, 200))
-    rng = np.random.default_rng(0)
-    left = jnp.asarray(rng.normal(size=(repeats, product.batch, product.rows, product.inner)), jnp.float32)
-    right = jnp.asarray(rng.normal(size=(product.batch, product.inner, product.columns)), jnp.float32)
-    loop = jax.jit(lambda left, right: jax.lax.map(lambda x: matrix_product(x, right), left))
-    return _median_seconds(lambda: loop(left, right).block_until_ready()) / repeats
 
 
 def _acting(say: Say) -> dict[str, float]:
@@ -187,7 +124,7 @@ def _acting(say: Say) -> dict[str, float]:
         for _ in range(500):
             place = env.step(policy(place)).observation
 
-    result = {"policy_us": 1e6 * _median_seconds(act) / 500, "env_steps_per_s": 500 / _median_seconds(step)}
+    result = {"policy_us": 1e6 * median_seconds(act) / 500, "env_steps_per_s": 500 / median_seconds(step)}
     env.close()
     say("policy, one action", f"{result['policy_us']:.1f} us", "NumPy alone")
     say(f"{TASK} with it", f"{result['env_steps_per_s']:.0f} steps/s", "without learning")
@@ -266,18 +203,7 @@ def _growth(say: Say) -> dict[str, dict[str, dict[int, float]]]:
 def update_ms(learner: Learner, phase: Phase) -> float:
     """Milliseconds of one update, of several in one call as in training."""
     batches = [made_up_batches(phase, UPDATES)] * len(learner.policies())
-    return 1e3 * _median_seconds(lambda: learner.update(phase, batches, 0)) / UPDATES
-
-
-def _median_seconds(call: Callable[[], Any]) -> float:
-    """Median time of a call that returns when it is done; the first, which compiles, does not count."""
-    call()
-    seconds = []
-    for _ in range(CALLS):
-        began = time.perf_counter()
-        call()
-        seconds.append(time.perf_counter() - began)
-    return float(np.median(seconds))
+    return 1e3 * median_seconds(lambda: learner.update(phase, batches, 0)) / UPDATES
 
 
 def made_up_learner(config: mbdpg.Config, seeds: int = 1) -> Learner:

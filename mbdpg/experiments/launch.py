@@ -35,6 +35,7 @@ ALIVE = "alive"
 PLATFORM = "JAX_PLATFORMS"
 LOOPBACK = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
 """0 has Ray listen on loopback alone; else its processes do on all interfaces, whatever address it is given."""
+QUIET: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -256,29 +257,22 @@ def _as_task(work: Work, log: Path, stop_file: Path) -> str | None:
 
 def _connected(address: str | None) -> Any:
     """Ray itself, connected to a cluster or, without an address, to a node begun here."""
-    # Ray reads it as it is imported, and so do the processes that it starts.
-    with _environment({LOOPBACK: "0"} if address is None else {}):
-        return _ray(address)
-
-
-def _ray(address: str | None) -> Any:
+    alone = {} if address else {LOOPBACK: "0"}
     try:
-        import ray
+        with _environment(alone):  # Ray reads it as it is imported, and so do the processes that it starts
+            import ray
     except ImportError as error:
         raise UserError("--engine ray needs Ray, which is not installed: pip install 'mbdpg[ray]'") from error
-    options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    if address is None:
-        address = "local"
-        options |= {"include_dashboard": False}
-    elif re.fullmatch(r"[^/]+:[0-9]{1,5}", address):
+    if address and re.fullmatch(r"[^/]+:[0-9]{1,5}", address):
         host, port = address.rsplit(":", 1)
         try:  # Ray would go on asking for minutes
             socket.create_connection((host, int(port)), timeout=10).close()
         except (OSError, OverflowError) as error:
             raise UserError(f"--address is {address}, where nothing answers: {error}") from error
     try:
-        ray.init(address=address, **options)
+        with _environment(alone):
+            ray.init(address=address or "local", include_dashboard=None if address else False, **QUIET)
     except (ConnectionError, ValueError, RuntimeError) as error:
         raise UserError(f"--address is {address}, where no Ray cluster answers: {error}") from error
     finally:

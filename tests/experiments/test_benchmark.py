@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from mbdpg.agents import mbdpg
-from mbdpg.experiments import benchmark
-from mbdpg.experiments.benchmark import Cost, Product, matrix_products
+from mbdpg.experiments import benchmark, products
+from mbdpg.experiments.benchmark import Cost
+from mbdpg.experiments.products import Product, matrix_products
 
 TINY = mbdpg.Config(
     **{"horizon": 2, "batch_size": 4, "fit_batch_size": 4, "fit_length": 2, "burn_in": 1},
@@ -83,7 +84,7 @@ def test_everything_is_measured_and_written(
     monkeypatch.setattr(benchmark, "PAPER_SIZES", TINY)
     monkeypatch.setattr(benchmark, "DEFAULTS", TINY)
     monkeypatch.setattr(benchmark, "GROWTH", {"seeds": (2,)})
-    monkeypatch.setattr(benchmark, "CALLS", 2)
+    monkeypatch.setattr(products, "CALLS", 2)
     monkeypatch.setattr(benchmark, "REPLAY_ROWS", 3000)
     main(["benchmark", "--json", str(tmp_path / "numbers.json")])
     numbers = json.loads((tmp_path / "numbers.json").read_text())
