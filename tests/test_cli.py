@@ -527,9 +527,9 @@ def test_a_finished_run_is_said_to_be_so_on_resume(say: Any, trained: Path) -> N
 def test_runs_that_go_on_one_after_the_other_are_named_before_their_progress(say: Any, toys: None) -> None:
     """Which of a folder's runs a progress line was of, nobody knew."""
     say("train", "Pendulum-v1", *TINY, "--seeds", "0", "1", "--out", "run")
-    assert "going on with" not in say("resume", "run").err  # both at once
+    assert "going on with" not in say("resume", "run", "--steps", "60").err  # both at once
     say("train", "Pendulum-v1", *TINY, "--seeds", "2", "--batch-size", "3", "--out", "run")
-    said = say("resume", "run").err
+    said = say("resume", "run", "--steps", "80").err
     assert "going on with run/seed-0, run/seed-1\n" in said and "going on with run/seed-2\n" in said
 
 

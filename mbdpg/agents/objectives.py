@@ -15,7 +15,7 @@ ActorValue = Literal["clipped", "mean"]
 
 
 def clipped_value(values: Float[Array, "critic *batch"]) -> Float[Array, "*batch"]:
-    """Q = min_i Q_i (Eq. 17), for targets and for the actor; each critic is regressed by itself."""
+    """Q = min_i Q_i (Eq. 17); each critic is regressed by itself."""
     return jnp.min(values, axis=0)
 
 

@@ -95,7 +95,7 @@ def _resume(args: list[str]) -> None:
 
             def display(going: Sequence[Path], config: RunConfig, env_steps: int) -> RunDisplay:
                 displays.close()  # of those before
-                if len(going) < len(runs):
+                if len(going) < len(runs) and env_steps < config.schedule.steps:
                     print(f"going on with {', '.join(map(str, going))}", file=sys.stderr)
                 if env_steps >= config.schedule.steps:
                     for run in going:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import logging
 import multiprocessing
 import os
 import re
@@ -34,8 +35,7 @@ ALIVE = "alive"
 """File beside the logs that every process of this machine's holds while it lives."""
 PLATFORM = "JAX_PLATFORMS"
 LOOPBACK = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
-"""0 has Ray listen on loopback alone; else its processes do on all interfaces, whatever address it is given."""
-QUIET: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
+"""0 has Ray listen on loopback alone, else on all interfaces. It reads it as it is imported: once in a process."""
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -257,24 +257,24 @@ def _as_task(work: Work, log: Path, stop_file: Path) -> str | None:
 
 def _connected(address: str | None) -> Any:
     """Ray itself, connected to a cluster or, without an address, to a node begun here."""
-    alone = {} if address else {LOOPBACK: "0"}
+    where = "local" if address is None else address
+    own = {LOOPBACK: "0"} if where == "local" else {}
     try:
-        with _environment(alone):  # Ray reads it as it is imported, and so do the processes that it starts
+        with _environment(own):
             import ray
     except ImportError as error:
         raise UserError("--engine ray needs Ray, which is not installed: pip install 'mbdpg[ray]'") from error
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    if address and re.fullmatch(r"[^/]+:[0-9]{1,5}", address):
-        host, port = address.rsplit(":", 1)
+    if found := re.fullmatch(r"([^/]+):([0-9]{1,5})", where):
         try:  # Ray would go on asking for minutes
-            socket.create_connection((host, int(port)), timeout=10).close()
+            socket.create_connection((found[1], int(found[2])), timeout=10).close()
         except (OSError, OverflowError) as error:
-            raise UserError(f"--address is {address}, where nothing answers: {error}") from error
+            raise UserError(f"--address is {where}, where nothing answers: {error}") from error
     try:
-        with _environment(alone):
-            ray.init(address=address or "local", include_dashboard=None if address else False, **QUIET)
+        with _environment(own):
+            ray.init(where, log_to_driver=False, logging_level=logging.ERROR, include_dashboard=False if own else None)
     except (ConnectionError, ValueError, RuntimeError) as error:
-        raise UserError(f"--address is {address}, where no Ray cluster answers: {error}") from error
+        raise UserError(f"--address is {where}, where no Ray cluster answers: {error}") from error
     finally:
         for number, handler in handlers.items():  # of which Ray took one
             signal.signal(number, handler)

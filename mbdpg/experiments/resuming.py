@@ -52,8 +52,8 @@ def resume(
             try:
                 saved = _saved(path, stack, make_env is not None, steps, allow_import)
             except UserError as error:
-                way = "none was resumed; move that one away to go on with the others, or resume each by its own folder"
-                raise UserError(f"{error}; {way}" if len(runs) > 1 else str(error)) from error
+                way = "; so none was resumed: the others go on if each is given by itself" if len(runs) > 1 else ""
+                raise UserError(f"{error}{way}") from error
             together[saved.place].append(saved)
         for group in together.values():
             if not should_stop():

@@ -13,7 +13,8 @@ import optax
 import pytest
 
 from mbdpg.agents.mbdpg import MBDPG, Config, State
-from mbdpg.dynamics.imagination import Ring
+from mbdpg.dynamics.fitting import warm_memory
+from mbdpg.dynamics.imagination import Ring, imagine
 from mbdpg.interfaces import Batch, EnvSpec, Statistics
 from mbdpg.training.replay import Replay
 
@@ -501,13 +502,24 @@ def test_returns_of_twenty_steps_leave_out_what_a_time_limit_cuts() -> None:
     end, cut = BURN_IN + 4, BURN_IN + 7
     windows = edited(batch(length, 3), valid=((1, slice(end, None)), 0), terminated=((1, end - 1), 1))
     windows = edited(windows, valid=((2, slice(cut, None)), 0))
+    elsewhere = edited(windows, reward=((2, cut - 1), 50.0), observation=((2, BURN_IN), 3.0), action=((2, 0), 0.9))
     found, other = (
-        one.diagnose(state(), jax.tree.map(jnp.asarray, edited(windows, reward=((2, cut - 1), paid))), jnp.zeros(3))
-        for paid in (1.0, 50.0)
+        one.diagnose(state(), jax.tree.map(jnp.asarray, some), jnp.zeros(3)) for some in (windows, elsewhere)
     )
     powers = 0.9 ** np.arange(20)
     rewards = np.asarray(windows.reward)[:, BURN_IN:]
     expected = (rewards[0] @ powers + rewards[1, :4] @ powers[:4]) / 2
     np.testing.assert_allclose(found["dynamics/return_observed"], expected, rtol=1e-4)
     assert found["dynamics/return_observed"] == other["dynamics/return_observed"]
-    assert found["dynamics/return_imagined"] == other["dynamics/return_imagined"] != 0
+    assert found["dynamics/reward_bias"] != other["dynamics/reward_bias"]
+    assert found["dynamics/return_imagined"] == other["dynamics/return_imagined"]
+    given = state().window(jax.tree.map(jnp.asarray, windows))
+    memory = warm_memory(
+        state().average_dynamics, given.observation[:, :BURN_IN], given.action[:, :BURN_IN], given.valid[:, :BURN_IN]
+    )
+    imagined = imagine(
+        *(state().average_dynamics, state().scales, state().average_actor, given.observation[:, BURN_IN], memory),
+        horizon=20,
+    )
+    rewards = np.asarray(imagined.rewards * imagined.survival()[:-1] * state().return_scale)
+    np.testing.assert_allclose(found["dynamics/return_imagined"], np.mean(powers @ rewards[:, :2]), rtol=1e-4)

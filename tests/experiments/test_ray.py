@@ -6,6 +6,7 @@ import contextlib
 import csv
 import dataclasses
 import json
+import os
 import socket
 import subprocess
 import sys
@@ -39,7 +40,7 @@ CONFIG = RunConfig("Pendulum-v1", td3.Config(width=8, batch_size=8, random_steps
 
 @contextlib.contextmanager
 def started(*nodes: tuple[str, ...]) -> Iterator[str]:
-    """The address of a cluster of such nodes on loopback, with a core each; other clusters are left alone.
+    """The address of a cluster of such nodes on this machine, with a core each; other clusters are left alone.
 
     Without tokens: Ray's nodes would ask for one where an earlier cluster left it in the home folder, and its clients
     not bring it.
@@ -145,14 +146,19 @@ def test_seeds_of_a_task_and_algorithm_share_a_gpu_and_one_process(
 ) -> None:
     """A GPU that is only said to be there: Ray hands it out, and JAX, which finds none, takes the processor."""
     short = dataclasses.replace(CONFIG, schedule=dataclasses.replace(SCHEDULE, steps=500))
-    monkeypatch.setattr(
-        module, "study", lambda name, scale: Study(name, "nothing", (Panel("alone", (Cell("td3", short),)),))
-    )
+    wider = dataclasses.replace(short, agent=dataclasses.replace(CONFIG.agent, width=9))
+    cells = (Cell("td3", short), Cell("td3 width=9", wider))
+    monkeypatch.setattr(module, "study", lambda name, scale: Study(name, "nothing", (Panel("width", cells),)))
     said: list[str] = []
-    with started(("--num-gpus=1",)) as address:
+    with started(("--num-gpus=1", "--num-cpus=2")) as address:
         reproduce("figure-8", "quick", tmp_path, Ray(address, gpus=True), seeds=(0, 1), say=said.append)
-    assert [path.name for path in (tmp_path / "logs").iterdir()] == ["Pendulum-v1-td3-seed-0-1.log"]
-    assert "figure-8: 1 of 1 to do" in said
+    logs = sorted(path.name for path in (tmp_path / "logs").iterdir())
+    assert logs == ["Pendulum-v1-td3-seed-0-1.log", "Pendulum-v1-td3-width=9-seed-0-1.log"]
+    assert "figure-8: 2 of 2 to do" in said
+    # One GPU and two cores: one after the other.
+    runs = [tmp_path / "Pendulum-v1" / cell.folder.name / "seed-0" for cell in cells]
+    spans = sorted([(run / name).stat().st_mtime for name in ("config.json", "metrics.jsonl")] for run in runs)
+    assert spans[0][1] <= spans[1][0]
     for seed in (0, 1):
         alone = Training(short, (seed,), tmp_path / "alone")
         alone(lambda: False)
@@ -176,16 +182,33 @@ def test_a_sweep_ends_each_trial_once_though_a_worker_is_killed(
         assert len(ends) == 7 and float(row["score"]) == pytest.approx(np.mean(ends[-LAST:]))
 
 
-def listening() -> set[tuple[str, int]]:
-    """Addresses, but for loopback, and ports that processes of this machine accept connections at."""
-    found = set()
+def family(process: int) -> list[Path]:
+    """Folders in /proc of a process and of all that descend from it."""
+    parents = {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):  # it has ended meanwhile
+            parents[int(folder.name)] = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+    found = [process]
+    for member in found:
+        found += [child for child, parent in parents.items() if parent == member]
+    return [Path("/proc") / str(member) for member in found]
+
+
+def open_to_others(process: int) -> set[str]:
+    """Addresses and ports, but for loopback's, at which a process or a descendant accepts connections."""
+    addresses = {}
     for table in (Path("/proc/net/tcp"), Path("/proc/net/tcp6")):
         for line in table.read_text().splitlines()[1:] if table.exists() else ():
-            (address, port), state = line.split()[1].split(":"), line.split()[3]
+            _, local, _, state, *rest = line.split()
+            address = local.partition(":")[0]
             loopback = address.endswith("7F") if len(address) == 8 else address.endswith(("01000000", "0100007F"))
             if state == "0A" and not loopback:
-                found.add((address, int(port, 16)))
-    return found
+                addresses[f"socket:[{rest[5]}]"] = local
+    held = set()
+    for member in family(process):
+        with contextlib.suppress(OSError):
+            held |= {addresses.get(os.readlink(file)) for file in (member / "fd").iterdir()}
+    return {address for address in held if address}
 
 
 def test_without_an_address_nothing_listens_to_other_machines(tmp_path: Path) -> None:
@@ -200,10 +223,11 @@ def test_without_an_address_nothing_listens_to_other_machines(tmp_path: Path) ->
         "sys.exit(str(launch([Training(config, (0,), out)], Ray(), logs=out / 'logs', say=print) or ''))"
     )
     command = [sys.executable, "-c", code, json.dumps(short.to_json()), str(work.out)]
-    before, during = listening(), set[tuple[str, int]]()
+    found, members = set[str](), 0
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         while process.poll() is None:
-            during |= listening()
+            found |= open_to_others(process.pid)
+            members = max(members, len(family(process.pid)))
             time.sleep(0.1)
         assert process.stderr is not None and process.stderr.read() == "\n"
-    assert work.finished() and during <= before
+    assert work.finished() and members > 3 and not found

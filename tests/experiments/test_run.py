@@ -352,7 +352,7 @@ def test_one_damaged_seed_stops_its_folder_and_the_way_on_is_said(toy_run: Path,
     """It was named, and how to go on with the others was not."""
     whole, damaged = edited(toy_run, tmp_path / "whole"), edited(toy_run, tmp_path / "damaged", agent=None)
     before = contents(whole)
-    with pytest.raises(UserError, match="damaged cannot .*config.json has no agent.*; none was resumed; move that one"):
+    with pytest.raises(UserError, match="damaged cannot .*config.json has no agent.*; so none was resumed: the others"):
         resuming.resume([whole, damaged], make_env=Toy, steps=60)
     assert contents(whole) == before
 

@@ -222,16 +222,19 @@ def test_a_click_in_the_legend_hides_a_group_in_all_charts_and_a_key_shows_it_ag
 
 
 def test_a_single_run_is_hidden_and_the_mean_is_of_the_others(browser: Browser, shown: Path) -> None:
-    mean = "document.querySelector('path.mean[data-group=\"0\"]').getAttribute('d')"
+    tooltip = "document.querySelector('.tooltip').innerText"
     browser.open(shown)
-    both = browser.get(mean)
+    browser.point_at("svg", across=0.99)
+    assert "1,000 to 1,010" in browser.get(tooltip)
     assert browser.get("document.querySelectorAll('.runs button').length") == 2  # of the one group that has several
     browser.point_at(".runs summary", click=True)
     browser.point_at(".runs button", click=True)
     assert browser.get("document.querySelectorAll('path.run').length") == 0
-    assert browser.get(mean) != both
-    browser.press(" ")
-    assert browser.get(mean) == both
+    browser.point_at("svg", across=0.99)
+    assert "1,010" in browser.get(tooltip) and " to " not in browser.get(tooltip)
+    browser.press(" ")  # the click has left the focus on the button
+    browser.point_at("svg", across=0.99)
+    assert "1,000 to 1,010" in browser.get(tooltip)
 
 
 def test_the_pointer_and_the_arrow_keys_read_values(browser: Browser, shown: Path) -> None:

@@ -41,16 +41,14 @@ def measure(config: Config, state: State, window: Window, realized_return: Float
     value = objectives.clipped_value(state.critics(now, window.action[:, config.burn_in])) * state.return_scale
     imagined = _imagine(state, state.average_actor, now, memory, depth=max(DEPTHS), printed=False)
     steps = slice(config.burn_in, None)
-    paid = (
-        window.reward[:, steps] * state.scales.reward + window.terminal_reward[:, steps] * state.scales.terminal_reward
-    )
+    paid = state.real_reward(window)[:, steps]
     exists = window.valid[:, steps]
     near = exists[:, :NEAR]
     excess = jnp.sum((imagined.rewards[:NEAR].T - paid[:, :NEAR]) * near) / jnp.sum(near)
     ended = jnp.max(window.terminated[:, steps] * exists, axis=1)
     discounts = config.discount ** jnp.arange(max(DEPTHS), dtype=jnp.float32)
     whole = jnp.maximum(ended, exists[:, -1])  # a time limit cuts the others
-    count = jnp.maximum(jnp.sum(whole), 1.0)
+    count = jnp.sum(whole)  # 0 gives NaN: nothing is known
     expected = imagined.rewards * imagined.survival()[:-1]
     errors = open_loop_error(state.average_dynamics, state.scales, window, burn_in=config.burn_in)
     return (
