@@ -171,7 +171,7 @@ class Cluster:
         """Raised where work is waited for."""
         self.refused = False
 
-    def init(self, **options: Any) -> None:
+    def init(self, address: str, **options: Any) -> None:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         if self.refused:
             raise ConnectionError("no")
