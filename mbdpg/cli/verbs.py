@@ -95,11 +95,11 @@ def _resume(args: list[str]) -> None:
 
             def display(going: Sequence[Path], config: RunConfig, env_steps: int) -> RunDisplay:
                 displays.close()  # of those before
-                if len(going) < len(runs) and env_steps < config.schedule.steps:
-                    print(f"going on with {', '.join(map(str, going))}", file=sys.stderr)
                 if env_steps >= config.schedule.steps:
                     for run in going:
                         print(f"{run} has its {env_steps:,} steps already; --steps makes it longer")
+                elif len(going) < len(runs):
+                    print(f"going on with {', '.join(map(str, going))}", file=sys.stderr)
                 return displays.enter_context(RunDisplay(config.schedule.steps, done=env_steps))
 
             resume(runs, steps=flags.steps, allow_import=flags.allow_import, watch=display, should_stop=stop)

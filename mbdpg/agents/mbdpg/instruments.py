@@ -48,17 +48,17 @@ def measure(config: Config, state: State, window: Window, realized_return: Float
     ended = jnp.max(window.terminated[:, steps] * exists, axis=1)
     discounts = config.discount ** jnp.arange(max(DEPTHS), dtype=jnp.float32)
     whole = jnp.maximum(ended, exists[:, -1])  # a time limit cuts the others
-    count = jnp.sum(whole)  # 0 gives NaN: nothing is known
-    expected = imagined.rewards * imagined.survival()[:-1]
+    shares = whole / jnp.sum(whole)  # 0 gives NaN: nothing is known
+    survival = imagined.survival()
     errors = open_loop_error(state.average_dynamics, state.scales, window, burn_in=config.burn_in)
     return (
         error_metrics(errors)
         | objectives.value_bias(value, realized_return)
         | {
             "dynamics/reward_bias": excess * state.return_scale,
-            "dynamics/return_imagined": jnp.sum((discounts @ expected) * whole) / count * state.return_scale,
-            "dynamics/return_observed": jnp.sum(((paid * exists) @ discounts) * whole) / count * state.return_scale,
-            "dynamics/survival_imagined": jnp.mean(imagined.survival()[-1]),
+            "dynamics/return_imagined": discounts @ (imagined.rewards * survival[:-1]) @ shares * state.return_scale,
+            "dynamics/return_observed": shares @ (paid * exists) @ discounts * state.return_scale,
+            "dynamics/survival_imagined": jnp.mean(survival[-1]),
             "dynamics/survival_observed": 1.0 - jnp.mean(ended),
             "dynamics/out_of_range": jnp.mean(jnp.abs(imagined.observations[1:]) > OUTLYING),
         }
