@@ -20,7 +20,7 @@ from mbdpg.cli import main
 from mbdpg.cli.places import Places
 from mbdpg.cli.verbs import VERBS
 from mbdpg.experiments import expert
-from mbdpg.experiments.launch import Local
+from mbdpg.experiments.pool import Local
 from mbdpg.storage import RunFolder
 
 Start = Callable[..., "subprocess.Popen[str]"]

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from mbdpg.experiments.launch import Local, Ray, cores
+from mbdpg.experiments.cluster import Ray
+from mbdpg.experiments.pool import Local, cores
 from mbdpg.interfaces import UserError, require
 
 

@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from mbdpg.experiments import expert
+from mbdpg.experiments.cluster import Ray
 from mbdpg.experiments.config import RunConfig
-from mbdpg.experiments.launch import Local, Ray, Work, launch
+from mbdpg.experiments.launch import Work, launch
 from mbdpg.experiments.model_study import ModelFit, is_whole
+from mbdpg.experiments.pool import Local
 from mbdpg.experiments.studies import RECORDED, SCALES, Cell, Model, Scale, ScaleName, Study, StudyName, study
 from mbdpg.experiments.work import Demonstrating, Training, origin_of
 from mbdpg.interfaces import require

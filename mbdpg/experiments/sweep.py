@@ -14,8 +14,10 @@ from typing import Any, Literal, final
 import numpy as np
 from matplotlib import pyplot as plt
 
+from mbdpg.experiments.cluster import Ray
 from mbdpg.experiments.config import RunConfig
-from mbdpg.experiments.launch import Local, Ray, launch
+from mbdpg.experiments.launch import launch
+from mbdpg.experiments.pool import Local
 from mbdpg.experiments.search import Search
 from mbdpg.experiments.work import Training
 from mbdpg.interfaces import UserError, flag_of, require

@@ -17,7 +17,9 @@ from typing import Any
 import pytest
 
 import mbdpg
-from mbdpg.experiments.launch import ALIVE, ATTEMPTS, Local, Ray, launch
+from mbdpg.experiments.cluster import Ray
+from mbdpg.experiments.launch import ATTEMPTS, launch
+from mbdpg.experiments.pool import ALIVE, Local
 from mbdpg.interfaces import UserError
 
 PIECES = """
@@ -120,7 +122,8 @@ def test_processes_of_a_launch_that_was_killed_are_waited_for(piece: Any, tmp_pa
 LAUNCHER = """
 import sys
 from pathlib import Path
-from mbdpg.experiments.launch import Local, launch
+from mbdpg.experiments.launch import launch
+from mbdpg.experiments.pool import Local
 from mbdpg.experiments.stopping import Stop
 from pieces_of_work import Piece
 

@@ -21,8 +21,10 @@ import pytest
 
 from mbdpg.agents import td3
 from mbdpg.experiments import reproduce as module
+from mbdpg.experiments.cluster import Ray
 from mbdpg.experiments.config import RunConfig
-from mbdpg.experiments.launch import Local, Ray, launch
+from mbdpg.experiments.launch import launch
+from mbdpg.experiments.pool import Local
 from mbdpg.experiments.reproduce import Training, reproduce
 from mbdpg.experiments.search import Search
 from mbdpg.experiments.studies import Cell, Panel, Study
@@ -218,7 +220,8 @@ def test_without_an_address_nothing_listens_to_other_machines(tmp_path: Path) ->
     # In a process that has not imported Ray for a cluster before.
     code = (
         "import json, pathlib, sys; from mbdpg.experiments.config import RunConfig; "
-        "from mbdpg.experiments.launch import Ray, launch; from mbdpg.experiments.reproduce import Training; "
+        "from mbdpg.experiments.cluster import Ray; from mbdpg.experiments.launch import launch; "
+        "from mbdpg.experiments.reproduce import Training; "
         "config, out = RunConfig.from_json(json.loads(sys.argv[1])), pathlib.Path(sys.argv[2]); "
         "sys.exit(str(launch([Training(config, (0,), out)], Ray(), logs=out / 'logs', say=print) or ''))"
     )

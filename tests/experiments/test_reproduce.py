@@ -14,7 +14,8 @@ import pytest
 from mbdpg.agents import td3
 from mbdpg.experiments import reproduce as module
 from mbdpg.experiments.config import RunConfig
-from mbdpg.experiments.launch import Local, Work
+from mbdpg.experiments.launch import Work
+from mbdpg.experiments.pool import Local
 from mbdpg.experiments.reproduce import reproduce
 from mbdpg.experiments.run import train
 from mbdpg.experiments.studies import SCALES, Cell, Panel, Study

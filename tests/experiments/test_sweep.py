@@ -13,7 +13,8 @@ import pytest
 from mbdpg.agents import mbdpg, td3
 from mbdpg.experiments import sweep as module
 from mbdpg.experiments.config import RunConfig
-from mbdpg.experiments.launch import Local, Work, launch
+from mbdpg.experiments.launch import Work, launch
+from mbdpg.experiments.pool import Local
 from mbdpg.experiments.search import Search
 from mbdpg.experiments.sweep import Trial, sweep
 from mbdpg.interfaces import UserError
