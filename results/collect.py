@@ -2,9 +2,9 @@
 
     python results/collect.py NAME RUN...     # run folders; without any, what NAME.csv has already
 
-NAME.csv has every evaluation of the runs, NAME.png every seed's curve and the mean over seeds, beside those of the
-rivals that were run on the same task (RIVALS). Printed are, per algorithm and budget: seeds, mean, standard deviation,
-and interquartile mean with its 95 % bootstrap interval.
+NAME.csv gets every evaluation of the runs, and keeps those of other seeds; NAME.png has every seed's curve and the mean
+over seeds, beside those of the rivals that were run on the same task (RIVALS). Printed are, per algorithm and budget:
+seeds, mean, standard deviation, and interquartile mean with its 95 % bootstrap interval.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ HERE = Path(__file__).parent
 BUDGETS = (50_000, 100_000)
 RIVALS = ("mbpo", "peers")
 """Files whose runs of ours on the same task are drawn beside those of NAME.csv."""
+WHOSE = ("env", "algorithm", "seed", "commit")
 COLUMNS = (
     "env_steps",
     "eval/return_mean",
@@ -56,18 +57,24 @@ Curves = dict[str, dict[int, float]]
 
 
 def collect(name: str, runs: list[Path]) -> None:
-    """Write NAME.csv, and print where the runs come from."""
+    """Write the runs into NAME.csv, in the place of what it has of the same tasks, algorithms and seeds."""
+    table: list[dict[str, str]] = []
+    if (HERE / f"{name}.csv").exists():
+        with open(HERE / f"{name}.csv", newline="") as file:
+            table = list(csv.DictReader(file))
+    for run in runs:
+        config = RunFolder.open(run).config
+        whose = {key: str(config[key]) for key in WHOSE}
+        print(whose, config["machine"]["cpu"])
+        table = [row for row in table if any(row[key] != whose[key] for key in WHOSE[:3])]
+        columns = {name: values for name, values in read_metrics(run, "eval").items() if name in COLUMNS}
+        for row in zip(*columns.values(), strict=True):
+            shown = (f"{value:.6g}" if isinstance(value, float) else str(value) for value in row)
+            table.append(whose | dict(zip(columns, shown, strict=True)))
     with open(HERE / f"{name}.csv", "w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["env", "algorithm", "seed", *COLUMNS])
-        for run in runs:
-            config = RunFolder.open(run).config
-            print({key: config[key] for key in ("env", "algorithm", "seed", "commit")}, config["machine"]["cpu"])
-            rows = read_metrics(run, "eval")
-            absent = [None] * len(rows["env_steps"])
-            for row in zip(*(rows.get(column, absent) for column in COLUMNS), strict=True):
-                shown = [f"{value:.6g}" if isinstance(value, float) else value for value in row]
-                writer.writerow([config["env"], config["algorithm"], config["seed"], *shown])
+        writer = csv.DictWriter(file, [*WHOSE, *COLUMNS], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(sorted(table, key=lambda row: (row["env"], row["algorithm"], int(row["seed"]))))
 
 
 def read(name: str) -> tuple[str, dict[str, Curves]]:
