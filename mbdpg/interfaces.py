@@ -36,6 +36,11 @@ def require(condition: bool, message: str) -> None:
         raise UserError(message)
 
 
+def one_line(text: str) -> str:
+    """Text without line breaks, cut where nobody reads on."""
+    return " ".join(text.split())[:500]
+
+
 def flag_of(setting: str) -> str:
     """The command line's flag for a setting."""
     return "--" + setting.replace("_", "-")

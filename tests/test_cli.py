@@ -16,9 +16,8 @@ import numpy as np
 import pytest
 
 import mbdpg
-from mbdpg.cli import main
+from mbdpg.cli import VERBS, main
 from mbdpg.cli.places import Places
-from mbdpg.cli.verbs import VERBS
 from mbdpg.experiments import expert
 from mbdpg.experiments.pool import Local
 from mbdpg.storage import RunFolder
@@ -43,7 +42,7 @@ def say(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     monkeypatch.setenv("COLUMNS", "100")
-    monkeypatch.setattr("mbdpg.cli.verbs.keep_compilations", lambda: None)
+    monkeypatch.setattr("mbdpg.cli.resume.keep_compilations", lambda: None)
 
     def run(*arguments: str | Path) -> Said:
         capsys.readouterr()
@@ -555,11 +554,18 @@ def test_debug_shows_the_traceback_and_without_it_there_is_none(mbdpg_command: S
     assert say("evaluate", "missing") == Said(1, "", said)
 
 
+def test_training_does_not_wait_for_what_draws() -> None:
+    """Every verb waited for Matplotlib, a fifth of a start."""
+    code = "import sys, mbdpg.cli.train, mbdpg.cli.evaluate; print('matplotlib' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"
+
+
 def test_an_unexpected_error_is_one_line_too(say: Any, monkeypatch: Any) -> None:
     def fail(arguments: list[str]) -> None:
         raise RuntimeError("first\nsecond")
 
-    monkeypatch.setitem(VERBS, "train", fail)
+    monkeypatch.setattr("mbdpg.cli.train.train", fail)
     said = say("train", "Pendulum-v1")
     assert said == Said(1, "", "mbdpg: unexpected RuntimeError: first second; --debug shows where\n")
     with pytest.raises(RuntimeError):
@@ -571,7 +577,7 @@ def test_too_little_memory_is_said_with_the_flags_that_lower_it(say: Any, monkey
     def fail(arguments: list[str]) -> None:
         raise error
 
-    monkeypatch.setitem(VERBS, "train", fail)
+    monkeypatch.setattr("mbdpg.cli.train.train", fail)
     check_refused(
         say("train", "Pendulum-v1"),
         "not enough memory",
@@ -583,5 +589,5 @@ def test_ctrl_c_where_there_is_nothing_to_save_is_no_traceback(say: Any, monkeyp
     def interrupted(arguments: list[str]) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setitem(VERBS, "evaluate", interrupted)
+    monkeypatch.setattr("mbdpg.cli.evaluate.evaluate", interrupted)
     assert say("evaluate", "run") == Said(130, "", "")

@@ -19,7 +19,7 @@ def test_python_example_trains_its_own_environment_and_acts(tmp_path: Path) -> N
 
 
 def test_verbs_and_flags_in_the_readme_exist() -> None:
-    from mbdpg.cli.verbs import VERBS
+    from mbdpg.cli import VERBS
 
     used = re.findall(r"^mbdpg (\w+)", README, re.MULTILINE)
     assert used and set(used) <= set(VERBS)

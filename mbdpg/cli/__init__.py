@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
 from collections.abc import Sequence
 
-from mbdpg.cli.flags import one_line
-from mbdpg.cli.verbs import VERBS
-from mbdpg.interfaces import UserError, require
+from mbdpg.interfaces import UserError, one_line, require
+
+VERBS = ("train", "resume", "evaluate", "demonstrate", "reproduce", "sweep", "report", "benchmark")
+"""Each is a function in a file of its name, read when it is called for: none waits for what another needs."""
 
 OVERVIEW = """usage: mbdpg VERB ...
 
@@ -34,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     try:
         require(args[0] in VERBS, f"there is no verb {args[0]!r}; expected one of {', '.join(VERBS)}")
-        VERBS[args[0]](args[1:])
+        getattr(importlib.import_module(f"mbdpg.cli.{args[0]}"), args[0])(args[1:])
     except BrokenPipeError:  # whoever read our output has seen enough
         sys.stderr.close()
         sys.exit(1)

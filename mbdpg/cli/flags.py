@@ -13,6 +13,9 @@ from typing import Annotated, Any
 
 import tyro
 
+from mbdpg.interfaces import one_line
+
+RunArgument = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
 EnvArgument = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ENV")]
 
 
@@ -44,11 +47,6 @@ def program() -> str:
     """What to type for this program where it was started."""
     called = Path(sys.argv[0])
     return str(called) if called.name == "mbdpg" and not shutil.which("mbdpg") else "mbdpg"
-
-
-def one_line(text: str) -> str:
-    """Text without line breaks, cut where nobody reads on."""
-    return re.sub(r"\s+", " ", text).strip()[:500]
 
 
 def _plain(text: str) -> str:

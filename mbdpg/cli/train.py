@@ -20,7 +20,6 @@ from mbdpg.experiments.config import CONFIGS, Algorithm, EnvOptions, RunConfig
 from mbdpg.experiments.stopping import Stop
 from mbdpg.interfaces import require
 from mbdpg.reports.console import RunDisplay
-from mbdpg.reports.curves import draw_curves
 from mbdpg.training.loop import Schedule
 
 
@@ -110,6 +109,8 @@ def default_folder(parent: str, config: RunConfig) -> Path:
 
 def finish(runs: Sequence[Path], algorithm: str, env: str) -> None:
     """Draw the learning curve beside the run folders and say what to do next."""
+    from mbdpg.reports.curves import draw_curves  # not before: Matplotlib is a fifth of a start
+
     folder = runs[0].parent
     draw_curves({algorithm: runs}, folder / "learning-curve.png", title=env)
     print(f"done: {folder}, learning curve in {folder / 'learning-curve.png'}")

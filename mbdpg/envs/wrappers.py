@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 from gymnasium.error import DependencyNotInstalled
 
-from mbdpg.interfaces import EnvSpec, NonFiniteError, Step, UserError
+from mbdpg.interfaces import EnvSpec, NonFiniteError, Step, UserError, one_line
 
 EXTRAS = {"box2d": "box2d", "mujoco": "mujoco", "classic_control": "classic-control"}
 """Folder of gymnasium.envs, to the extra of the pip package that its environments need."""
@@ -150,13 +150,13 @@ def missing_package(env_id: str, module: str, error: Exception) -> UserError:
     family = module.removeprefix("gymnasium.envs.").partition(".")[0]
     if family in EXTRAS:
         return UserError(f'{env_id} needs a package that is not installed: pip install "gymnasium[{EXTRAS[family]}]"')
-    return UserError(f"{env_id} needs a package that is not installed ({_one_line(error)}): pip install that package")
+    return UserError(f"{env_id} needs a package that is not installed ({_named(error)}): pip install that package")
 
 
 def cannot_draw(env_id: str, error: Exception) -> UserError:
     """Says how to give MuJoCo a working OpenGL back end, after `error`."""
     return UserError(
-        f"{env_id} cannot draw on this machine with MUJOCO_GL={os.environ.get('MUJOCO_GL', '')} ({_one_line(error)}): "
+        f"{env_id} cannot draw on this machine with MUJOCO_GL={os.environ.get('MUJOCO_GL', '')} ({_named(error)}): "
         "set MUJOCO_GL=egl (Debian: apt install libegl1 libegl-mesa0 libgl1) or MUJOCO_GL=osmesa (Debian: apt install "
         "libosmesa6), or unset it and do without frames"
     )
@@ -188,5 +188,5 @@ def _first_non_finite(values: np.ndarray) -> str:
     return f"entry {index} = {values[index]}"
 
 
-def _one_line(error: Exception) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split())
+def _named(error: Exception) -> str:
+    return one_line(f"{type(error).__name__}: {error}")

@@ -132,7 +132,7 @@ def _starting(say: Say) -> dict[str, float]:
     result: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as cache:
         keep = {"JAX_COMPILATION_CACHE_DIR": cache, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.3"}
-        code = "import sys, mbdpg.cli; from mbdpg.experiments import benchmark; benchmark.start(*sys.argv[1:])"
+        code = "import sys, mbdpg.cli.train; from mbdpg.experiments import benchmark; benchmark.start(*sys.argv[1:])"
         settings = json.dumps(dataclasses.asdict(DEFAULTS))
         for name in ("cold_start_s", "warm_start_s"):
             command = [sys.executable, "-c", code, settings, str(REPLAY_ROWS), str(time.time())]

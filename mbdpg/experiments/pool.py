@@ -18,7 +18,7 @@ from pathlib import Path
 
 from mbdpg.experiments.launch import ATTEMPTS, PLATFORM, POLL_SECONDS, Work, environment, log_of
 from mbdpg.experiments.stopping import Stop
-from mbdpg.interfaces import UserError, require
+from mbdpg.interfaces import UserError, one_line, require
 
 FAILED = 1
 """Exit status of work that raised, which would do so again."""
@@ -147,7 +147,7 @@ def _in_process(work: Work, cores: list[int], log: Path) -> None:
         except Exception as error:
             if not isinstance(error, UserError):
                 traceback.print_exc()
-            print(f"mbdpg: {' '.join(str(error).split())}", file=sys.stderr)
+            print(f"mbdpg: {one_line(str(error))}", file=sys.stderr)
             sys.exit(FAILED)
 
 

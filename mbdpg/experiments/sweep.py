@@ -11,7 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, final
 
+import matplotlib
 import numpy as np
+
+matplotlib.use("Agg")  # no display is ever needed
 from matplotlib import pyplot as plt
 
 from mbdpg.experiments.cluster import Ray

@@ -6,10 +6,7 @@ import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")  # no display is ever needed
-from matplotlib import pyplot as plt
+from matplotlib.figure import Figure
 
 from mbdpg.interfaces import UserError
 from mbdpg.reports.record import learning_curve, mean_curve
@@ -30,7 +27,8 @@ def draw_curves(groups: Mapping[str, Sequence[Path]], path: Path, *, title: str)
     known = {label: [curve for curve in map(learning_curve, runs) if curve] for label, runs in groups.items()}
     if not any(known.values()):
         raise UserError("no run has an evaluation yet; train until the first one, then draw again")
-    figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
+    figure = Figure(figsize=(7, 4.2), layout="constrained")
+    axes = figure.subplots()
     for number, (label, curves) in enumerate(known.items()):
         if not curves:
             continue
@@ -44,7 +42,6 @@ def draw_curves(groups: Mapping[str, Sequence[Path]], path: Path, *, title: str)
     axes.legend()
     picture = io.BytesIO()
     figure.savefig(picture, format=path.suffix[1:], dpi=130)
-    plt.close(figure)
     try:
         replace_durably(path, picture.getvalue())  # and not what a link there points to
     except OSError as error:

@@ -7,11 +7,8 @@ from collections.abc import Callable, Sequence, Sized
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
-
-matplotlib.use("Agg")  # no display is ever needed
-from matplotlib import pyplot as plt
+from matplotlib.figure import Figure
 
 from mbdpg.reports.panels import Curves, Errors, Panels
 from mbdpg.reports.record import shared_steps
@@ -74,8 +71,8 @@ def _seeds(runs: Sized) -> str:
 def _picture(panels: Panels) -> bytes:
     """A column per panel. Learning curves have a row as in the paper, one for few seeds, one that counts experts."""
     rows = 3 if any(isinstance(panel, Curves) for panel in panels) else 1
-    size = (5.0 * len(panels), 3.4 * rows)
-    figure, grid = plt.subplots(rows, len(panels), figsize=size, squeeze=False, layout="constrained")
+    figure = Figure(figsize=(5.0 * len(panels), 3.4 * rows), layout="constrained")
+    grid = figure.subplots(rows, len(panels), squeeze=False)
     for column, panel in zip(grid.T, panels, strict=True):
         if isinstance(panel, Errors):
             _draw_errors(column[0], panel)
@@ -94,7 +91,6 @@ def _picture(panels: Panels) -> bytes:
             column[0].legend(fontsize="small")
     picture = io.BytesIO()
     figure.savefig(picture, format="png", dpi=90)
-    plt.close(figure)
     return picture.getvalue()
 
 
