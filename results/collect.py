@@ -65,6 +65,7 @@ def collect(name: str, runs: list[Path]) -> None:
     for run in runs:
         config = RunFolder.open(run).config
         whose = {key: str(config[key]) for key in WHOSE}
+        whose["commit"] = whose["commit"][:7] + whose["commit"][40:]  # a + where files had changed
         print(whose, config["machine"]["cpu"])
         table = [row for row in table if any(row[key] != whose[key] for key in WHOSE[:3])]
         columns = {name: values for name, values in read_metrics(run, "eval").items() if name in COLUMNS}
