@@ -18,6 +18,7 @@ import matplotlib
 
 from mbdpg.reports.record import mean_curve
 from mbdpg.reports.statistics import summarize
+from mbdpg.storage.files import replace_table
 from mbdpg.storage.metrics import read_metrics
 from mbdpg.storage.run_folder import RunFolder
 
@@ -64,18 +65,23 @@ def collect(name: str, runs: list[Path]) -> None:
             table = list(csv.DictReader(file))
     for run in runs:
         config = RunFolder.open(run).config
-        whose = {key: str(config[key]) for key in WHOSE}
-        whose["commit"] = whose["commit"][:7] + whose["commit"][40:]  # a + where files had changed
+        commit = config["commit"] or ""
+        short = commit[:7] + commit[40:]  # a plus follows where files had changed
+        whose = {name: str(config[name]) for name in WHOSE[:3]} | {"commit": short}
         print(whose, config["machine"]["cpu"])
         table = [row for row in table if any(row[key] != whose[key] for key in WHOSE[:3])]
         columns = {name: values for name, values in read_metrics(run, "eval").items() if name in COLUMNS}
         for row in zip(*columns.values(), strict=True):
-            shown = (f"{value:.6g}" if isinstance(value, float) else str(value) for value in row)
-            table.append(whose | dict(zip(columns, shown, strict=True)))
-    with open(HERE / f"{name}.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, [*WHOSE, *COLUMNS], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(sorted(table, key=lambda row: (row["env"], row["algorithm"], int(row["seed"]))))
+            table.append(whose | dict(zip(columns, map(_shown, row), strict=True)))
+    table.sort(key=lambda row: (row["env"], row["algorithm"], int(row["seed"])))
+    names = [*WHOSE, *COLUMNS]
+    replace_table(HERE / f"{name}.csv", [names, *([row.get(name, "") for name in names] for row in table)])
+
+
+def _shown(value: object) -> str:
+    if value is None:
+        return ""
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def read(name: str) -> tuple[str, dict[str, Curves]]:

@@ -555,7 +555,7 @@ def test_debug_shows_the_traceback_and_without_it_there_is_none(mbdpg_command: S
 
 
 def test_training_does_not_wait_for_what_draws() -> None:
-    """Every verb waited for Matplotlib, a fifth of a start."""
+    """Every verb waited for Matplotlib, a fifth of all modules' time."""
     code = "import sys, mbdpg.cli.train, mbdpg.cli.evaluate; print('matplotlib' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "False\n"

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from mbdpg.experiments.cluster import Ray
+from mbdpg.experiments.launch import Engine
 from mbdpg.experiments.pool import Local, cores
 from mbdpg.interfaces import UserError, require
 
@@ -44,7 +45,7 @@ def say(line: str) -> None:
     print(line, flush=True)
 
 
-def engine_of(places: Places) -> Local | Ray:
+def engine_of(places: Places) -> Engine:
     """What the flags say.
 
     Raises:

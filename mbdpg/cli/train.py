@@ -109,7 +109,7 @@ def default_folder(parent: str, config: RunConfig) -> Path:
 
 def finish(runs: Sequence[Path], algorithm: str, env: str) -> None:
     """Draw the learning curve beside the run folders and say what to do next."""
-    from mbdpg.reports.curves import draw_curves  # not before: Matplotlib is a fifth of a start
+    from mbdpg.reports.curves import draw_curves  # not before: Matplotlib is a fifth of all modules' time
 
     folder = runs[0].parent
     draw_curves({algorithm: runs}, folder / "learning-curve.png", title=env)

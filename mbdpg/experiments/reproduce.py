@@ -10,9 +10,8 @@ from typing import Any
 from mbdpg.experiments import expert
 from mbdpg.experiments.cluster import Ray
 from mbdpg.experiments.config import RunConfig
-from mbdpg.experiments.launch import Work, launch
+from mbdpg.experiments.launch import Engine, Work, launch
 from mbdpg.experiments.model_study import ModelFit, is_whole
-from mbdpg.experiments.pool import Local
 from mbdpg.experiments.studies import RECORDED, SCALES, Cell, Model, Scale, ScaleName, Study, StudyName, study
 from mbdpg.experiments.work import Demonstrating, Training, origin_of
 from mbdpg.interfaces import require
@@ -26,7 +25,7 @@ def reproduce(
     name: StudyName,
     scale_name: ScaleName,
     out: Path,
-    engine: Local | Ray,
+    engine: Engine,
     *,
     seeds: Sequence[int] = (),
     say: Callable[[str], None],
@@ -119,7 +118,7 @@ def _errors_file(model: Model, seed: int, out: Path) -> Path:
     return out / "models" / model.label.replace(" ", "-") / f"seed-{seed}.csv"
 
 
-def _command(name: StudyName, scale_name: ScaleName, seeds: Sequence[int], engine: Local | Ray) -> str:
+def _command(name: StudyName, scale_name: ScaleName, seeds: Sequence[int], engine: Engine) -> str:
     """What makes the same from nothing, wherever it lies."""
     words = ["mbdpg reproduce", name, "--scale", scale_name, *(["--seeds", *map(str, seeds)] if seeds else [])]
     if isinstance(engine, Ray):

@@ -17,10 +17,8 @@ import numpy as np
 matplotlib.use("Agg")  # no display is ever needed
 from matplotlib import pyplot as plt
 
-from mbdpg.experiments.cluster import Ray
 from mbdpg.experiments.config import RunConfig
-from mbdpg.experiments.launch import launch
-from mbdpg.experiments.pool import Local
+from mbdpg.experiments.launch import Engine, launch
 from mbdpg.experiments.search import Search
 from mbdpg.experiments.work import Training
 from mbdpg.interfaces import UserError, flag_of, require
@@ -134,7 +132,7 @@ def sweep(
     seeds: Sequence[int],
     prune: bool,
     out: Path,
-    engine: Local | Ray,
+    engine: Engine,
     say: Callable[[str], None],
     should_stop: Callable[[], bool] = lambda: False,
 ) -> None:

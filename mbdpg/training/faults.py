@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeVar
 
-from mbdpg.interfaces import UserError
+from mbdpg.interfaces import UserError, one_line
 
 Result = TypeVar("Result")
 
@@ -26,4 +26,4 @@ def guarded(call: Callable[[], Result]) -> Result:
     except UserError:
         raise
     except Exception as error:
-        raise EnvironmentFailedError(" ".join(f"{type(error).__name__}: {error}".split())) from error
+        raise EnvironmentFailedError(one_line(f"{type(error).__name__}: {error}")) from error
