@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import matplotlib.figure
 import numpy as np
 import pytest
+from matplotlib import pyplot as plt
 from matplotlib.lines import Line2D
 
 from mbdpg.interfaces import UserError
@@ -25,7 +27,7 @@ def run_with(folder: Path, returns: dict[int, float], kind: str = "eval") -> Pat
 
 
 @pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+def drawn(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Any]]:
     """The lines of every picture that is saved: (environment steps, returns, label)."""
     lines: list[Any] = []
     save = matplotlib.figure.Figure.savefig
@@ -38,7 +40,8 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     monkeypatch.setattr(matplotlib.figure.Figure, "savefig", note)
     monkeypatch.setattr(Line2D, "get_xdata", lambda self, orig=True, get=Line2D.get_xdata: np.asarray(get(self)))
     monkeypatch.setattr(Line2D, "get_ydata", lambda self, orig=True, get=Line2D.get_ydata: np.asarray(get(self)))
-    return lines
+    yield lines
+    assert plt.get_fignums() == []
 
 
 def test_each_run_is_a_line_and_their_mean_is_one_more(tmp_path: Path, drawn: list[Any]) -> None:
@@ -82,18 +85,20 @@ def test_without_any_evaluation_one_line_says_what_to_do(tmp_path: Path) -> None
     runs = [run_with(tmp_path / "a", {0: 1.0}, kind="train"), run_with(tmp_path / "b", {0: float("nan")})]
     with pytest.raises(UserError, match="no run has an evaluation yet; train until the first one"):
         curves.draw_curves({"mbdpg": runs}, tmp_path / "curve.png", title="")
-    assert not (tmp_path / "curve.png").exists()
+    assert plt.get_fignums() == [] and not (tmp_path / "curve.png").exists()
 
 
 def test_a_folder_that_is_no_run_is_named(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"has no metrics.jsonl; expected the folder of a run"):
         curves.draw_curves({"mbdpg": [tmp_path]}, tmp_path / "curve.png", title="")
+    assert plt.get_fignums() == []
 
 
 def test_where_no_picture_can_be_written_one_line_says_so(tmp_path: Path) -> None:
     runs = [run_with(tmp_path / "a", {0: 1.0})]
     with pytest.raises(UserError, match="cannot write .*curve.png: No such file or directory"):
         curves.draw_curves({"mbdpg": runs}, tmp_path / "missing" / "curve.png", title="")
+    assert plt.get_fignums() == []
 
 
 def test_drawing_needs_no_display_and_leaves_no_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -102,3 +107,4 @@ def test_drawing_needs_no_display_and_leaves_no_warning(tmp_path: Path, monkeypa
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         curves.draw_curves({"mbdpg": runs}, tmp_path / "curve.png", title="$x_1$")
+    assert plt.get_backend().lower() == "agg"
