@@ -37,7 +37,7 @@ def temporal_difference_target(
 def expanded_values(
     rewards: Float[Array, "time batch"],
     continues: Float[Array, "time batch"],
-    values: Float[Array, "state batch"],
+    next_values: Float[Array, "time batch"],
     discount: float,
     trace: float | Float[Array, "time batch"],
 ) -> Float[Array, "time batch"]:
@@ -54,8 +54,10 @@ def expanded_values(
         target = reward + discount * alive * ((1.0 - share) * next_value + share * after)
         return target, target
 
-    steps = (rewards, continues, values[1:], jnp.full(rewards.shape, trace, rewards.dtype))
-    return jax.lax.scan(step, values[-1], steps, reverse=True)[1]
+    if rewards.shape[0] == 0:
+        return rewards
+    steps = (rewards, continues, next_values, jnp.full(rewards.shape, trace, rewards.dtype))
+    return jax.lax.scan(step, next_values[-1], steps, reverse=True)[1]
 
 
 def likeness(

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from mbdpg.networks.mlp import MLP
+from mbdpg.networks.mlp import MLP, Slopes
 
 
 class Critics(eqx.Module):
@@ -35,8 +35,34 @@ class Critics(eqx.Module):
     def __call__(
         self, observation: Float[Array, "*batch observation"], action: Float[Array, "*batch action"]
     ) -> Float[Array, "critic *batch"]:
-        pair = jnp.concatenate([observation, action], axis=-1)
-        # As one axis of rows, over which XLA sums weights' gradients without first transposing what it sums.
-        rows = pair.reshape(-1, pair.shape[-1])
+        pair, rows = _paired(observation, action)
         values: Array = eqx.filter_vmap(lambda mlp, x: mlp(x), in_axes=(0, None))(self.mlps, rows)
         return values.reshape(-1, *pair.shape[:-1])
+
+    def with_slopes(
+        self, observation: Float[Array, "*batch observation"], action: Float[Array, "*batch action"]
+    ) -> tuple[Float[Array, "critic *batch"], Slopes]:
+        """Values, and all their derivatives (leading axis `critic`; of all of `batch`, `row`).
+
+        By what a critic sees, values have the derivative they always have; by its parameters none: that is `weighed`,
+        of the same slopes. So an actor's loss and the critics' own cost one way through the critics and back.
+        """
+        pair, rows = _paired(observation, action)
+        slopes: Slopes = jax.lax.stop_gradient(eqx.filter_vmap(MLP.slopes, in_axes=(0, None))(self.mlps, rows))
+        nothing = (rows - jax.lax.stop_gradient(rows))[None]
+        values = slopes.output + jnp.sum(slopes.by_input * nothing, axis=-1)
+        return values.reshape(-1, *pair.shape[:-1]), slopes
+
+    def weighed(self, slopes: Slopes, weights: Float[Array, "critic *batch"]) -> Critics:
+        """The derivative of the values' weighted sum by every parameter."""
+        rows = weights.reshape(weights.shape[0], -1)
+        return eqx.tree_at(lambda x: x.mlps, self, eqx.filter_vmap(MLP.weighed)(self.mlps, slopes, rows))
+
+
+def _paired(observation: Array, action: Array) -> tuple[Array, Array]:
+    """What a critic sees, and the same as one axis of rows.
+
+    Over that XLA sums weights' gradients without first transposing what it sums.
+    """
+    pair = jnp.concatenate([observation, action], axis=-1)
+    return pair, pair.reshape(-1, pair.shape[-1])

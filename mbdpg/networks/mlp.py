@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -72,6 +73,16 @@ class NormalizedELU(eqx.Module):
         return _normalized_elu(x, self.scale, self.offset)
 
 
+class Slopes(NamedTuple):
+    """A scalar network's outputs and, row by row, their derivatives: one way back through it for any weights."""
+
+    output: Float[Array, " row"]
+    by_input: Float[Array, "row inputs"]
+    hidden: tuple[tuple[Array, Array, Array, Array], ...]
+    """Per layer: its inputs, what it normalized, and the derivatives by its products and by its activations' inputs."""
+    features: Float[Array, "row width"]
+
+
 class MLP(eqx.Module):
     """Hidden layers of Linear and NormalizedELU, or of Linear and ReLU; then a Linear output."""
 
@@ -114,6 +125,32 @@ class MLP(eqx.Module):
             x = norm(linear(x))
         return x
 
+    def slopes(self, x: Float[Array, "row inputs"]) -> Slopes:
+        """The output at every row and its derivatives, of a network with norms and one output."""
+        inputs, saved = [x], []
+        for linear, norm in zip(self.hidden, self.norms, strict=True):
+            y, own = _normalize_and_activate(linear(inputs[-1]), norm.scale, norm.offset)
+            inputs.append(y)
+            saved.append(own)
+        *inputs, features = inputs
+        slope = jnp.broadcast_to(self.output.weight[:, 0], features.shape)
+        hidden = []
+        for linear, before, own in zip(self.hidden[::-1], inputs[::-1], saved[::-1], strict=True):
+            by_product, by_affine = _row_derivatives(own, slope)
+            hidden.append((before, own[0], by_product, by_affine))
+            slope = matrix_product(by_product, linear.weight.T)
+        return Slopes(self.output(features)[:, 0], slope, tuple(hidden[::-1]), features)
+
+    def weighed(self, slopes: Slopes, weights: Float[Array, " row"]) -> MLP:
+        """The derivative of the outputs' weighted sum by every parameter."""
+        hidden, norms = [], []
+        for before, normalized, by_product, by_affine in slopes.hidden:
+            by_product, by_affine = by_product * weights[:, None], by_affine * weights[:, None]
+            hidden.append((matrix_product(before.T, by_product), jnp.sum(by_product, axis=0)))
+            norms.append((jnp.sum(by_affine * normalized, axis=0), jnp.sum(by_affine, axis=0)))
+        output = matrix_product(slopes.features.T, weights[:, None]), jnp.sum(weights)[None]
+        return jax.tree.unflatten(jax.tree.structure(self), jax.tree.leaves((hidden, norms, output)))
+
 
 def _along(vector: Float[Array, " features"], like: Array) -> Array:
     """Give a feature vector the rank of `like`: ranks are promoted explicitly throughout (a silent one hides bugs)."""
@@ -134,14 +171,19 @@ def _normalized_elu(x: Array, scale: Array, offset: Array) -> Array:
     return _normalize_and_activate(x, scale, offset)[0]
 
 
-def _derivative(saved: tuple[Array, ...], gradient: Array) -> tuple[Array, Array, Array]:
+def _row_derivatives(saved: tuple[Array, ...], gradient: Array) -> tuple[Array, Array]:
+    """By x, and by what ELU was taken of."""
     normalized, rate, scale, y = saved
     inner = gradient * jnp.minimum(y + 1.0, 1.0)  # the slope of ELU is exp(x) = y + 1 below zero and 1 above
     scaled = inner * _along(scale, inner)
     along = jnp.mean(scaled * normalized, axis=-1, keepdims=True)
-    to_x = rate * (scaled - jnp.mean(scaled, axis=-1, keepdims=True) - normalized * along)
-    batch = tuple(range(y.ndim - 1))
-    return to_x, jnp.sum(inner * normalized, axis=batch), jnp.sum(inner, axis=batch)
+    return rate * (scaled - jnp.mean(scaled, axis=-1, keepdims=True) - normalized * along), inner
+
+
+def _derivative(saved: tuple[Array, ...], gradient: Array) -> tuple[Array, Array, Array]:
+    to_x, inner = _row_derivatives(saved, gradient)
+    batch = tuple(range(inner.ndim - 1))
+    return to_x, jnp.sum(inner * saved[0], axis=batch), jnp.sum(inner, axis=batch)
 
 
 _normalized_elu.defvjp(_normalize_and_activate, _derivative)

@@ -13,7 +13,7 @@ import optax
 import pytest
 
 from mbdpg.agents.mbdpg import MBDPG, Config, State
-from mbdpg.dynamics.fitting import warm_memory
+from mbdpg.dynamics.fitting import Window, warm_memory
 from mbdpg.dynamics.imagination import Ring, imagine
 from mbdpg.interfaces import Batch, EnvSpec, Statistics
 from mbdpg.training.replay import Replay
@@ -109,6 +109,11 @@ def edited(original: Batch, **changes: tuple[Any, float]) -> Batch:
     for name, (at, value) in changes.items():
         getattr(copy, name)[at] = value
     return copy
+
+
+def last(window: Window) -> tuple[jax.Array, jax.Array]:
+    """The observations and actions that improving learns from."""
+    return window.observation[:, -1], window.action[:, -1]
 
 
 @pytest.mark.parametrize("name", ["fit", "clone", "improve", "ground"])
@@ -262,7 +267,7 @@ def test_without_a_horizon_the_critics_target_is_td3s() -> None:
     one, key = agent((("horizon", 0), ("target_noise", 0.0))), jax.random.key(0)
     window = state().window(jax.tree.map(jnp.asarray, edited(BATCHES["improve"], terminated=((0, -1), 1))))
     start = one._start(state(), window, key=key)
-    imagined = one._actor_loss(state().actor, state(), start, key)[1][0]
+    imagined = one._actor_loss(state().actor, state(), last(window), start, key)[1][0]
     found, along = one._targets(state(), window, start, imagined, key=key)
     after = window.next_observation[:, -1]
     value = np.min(state().target_critics(after, state().target_actor(after)), axis=0)
@@ -285,7 +290,7 @@ def test_the_actor_climbs_the_value_that_it_is_told_to(actor_value: str, reduced
     one = agent((("horizon", 0), ("actor_value", actor_value)))
     window = state().window(jax.tree.map(jnp.asarray, BATCHES["improve"]))
     start = one._start(state(), window, key=jax.random.key(0))
-    _, (_, metrics) = one._actor_loss(state().actor, state(), start, jax.random.key(0))
+    _, (_, _, metrics) = one._actor_loss(state().actor, state(), last(window), start, jax.random.key(0))
     values = state().critics(start.observation, state().actor(start.observation))
     np.testing.assert_allclose(metrics["actor/objective"], np.mean(reduced(values, axis=0)), rtol=1e-5)
 
@@ -310,7 +315,7 @@ def test_the_real_step_is_the_first_of_the_expansion(trace: float) -> None:
     data = jax.tree.map(jnp.asarray, edited(BATCHES["improve"], terminated=((0, -1), 1)))
     window, key = state().window(data), jax.random.key(0)
     start = one._start(state(), window, key=key)
-    _, (imagined, _) = one._actor_loss(state().actor, state(), start, key)
+    _, (imagined, *_) = one._actor_loss(state().actor, state(), last(window), start, key)
     found = one._targets(state(), window, start, imagined, key=key)
     value = np.asarray(one._target_value(state(), imagined.observations, key=key))
     rewards, alive = np.asarray(imagined.rewards), np.asarray(imagined.continues)

@@ -15,7 +15,7 @@ def draw(*shape: int, seed: int = 0) -> np.ndarray:
 
 
 def expanded(rewards, continues, values, trace: float = 1.0, discount: float = GAMMA) -> np.ndarray:
-    arrays = (jnp.asarray(x, jnp.float32) for x in (rewards, continues, values))
+    arrays = (jnp.asarray(x, jnp.float32) for x in (rewards, continues, values[1:]))
     return np.asarray(objectives.expanded_values(*arrays, discount, trace))
 
 

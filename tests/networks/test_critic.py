@@ -42,3 +42,27 @@ def test_one_critics_value_does_not_move_the_other(key: jax.Array) -> None:
     for leaf in jax.tree.leaves(gradient):
         assert not leaf[1].any()
     assert gradient.mlps.output.bias[0].any()
+
+
+def test_one_way_back_through_the_critics_serves_the_actor_and_themselves(key: jax.Array) -> None:
+    critics = shaken(Critics(3, 2, (8, 8), key=key))
+    rng = np.random.default_rng(2)
+    observation, action, weights = (
+        jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in ((4, 5, 3), (4, 5, 2), (2, 4, 5))
+    )
+
+    def plain(critics: Critics, observation: jax.Array, action: jax.Array) -> jax.Array:
+        return jnp.sum(weights * critics(observation, action))
+
+    def ours(critics: Critics, observation: jax.Array, action: jax.Array) -> jax.Array:
+        return jnp.sum(weights * critics.with_slopes(observation, action)[0])
+
+    everything = (0, 1, 2)
+    value, (by_parameter, *by_input) = jax.value_and_grad(plain, everything)(critics, observation, action)
+    np.testing.assert_allclose(ours(critics, observation, action), value, rtol=1e-5)
+    nothing, *mine = jax.grad(ours, everything)(critics, observation, action)
+    weighed = critics.weighed(critics.with_slopes(observation, action)[1], weights)
+    for found, expected in ((mine, by_input), (weighed, by_parameter)):
+        for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-4)
+    assert not any(leaf.any() for leaf in jax.tree.leaves(nothing))

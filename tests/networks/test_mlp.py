@@ -115,6 +115,25 @@ def test_normalization_and_elu_have_the_derivative_that_differentiating_them_giv
         np.testing.assert_allclose(mine, other, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.parametrize("widths", [(), (6,), (8, 4, 6)])
+def test_slopes_are_the_derivatives_that_differentiating_gives(key: jax.Array, widths: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(5)
+    mlp = jax.tree.map(lambda x: x + jnp.asarray(rng.normal(0, 0.3, x.shape), jnp.float32), MLP(3, widths, 1, key=key))
+    x, weights = (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in ((7, 3), (7,)))
+
+    def weighed(mlp: MLP, x: jax.Array) -> jax.Array:
+        return jnp.sum(mlp(x)[:, 0] * weights)
+
+    slopes = mlp.slopes(x)
+    np.testing.assert_allclose(slopes.output, mlp(x)[:, 0], rtol=1e-6)
+    by_parameter, by_input = jax.grad(weighed, argnums=(0, 1))(mlp, x)
+    np.testing.assert_allclose(weights[:, None] * slopes.by_input, by_input, rtol=1e-4, atol=1e-5)
+    found = mlp.weighed(slopes, weights)
+    assert jax.tree.structure(found) == jax.tree.structure(mlp)
+    for mine, other in zip(jax.tree.leaves(found), jax.tree.leaves(by_parameter), strict=True):
+        np.testing.assert_allclose(mine, other, rtol=1e-4, atol=1e-5)
+
+
 def test_the_gradient_reaches_every_parameter(key: jax.Array) -> None:
     mlp = MLP(3, (8, 8), 2, key=key)
     gradient = jax.grad(lambda m, x: jnp.sum(jnp.square(m(x))))(

@@ -20,6 +20,7 @@ from mbdpg.dynamics.imagination import Ring, Start, Trajectory, imagine
 from mbdpg.dynamics.mixture import Scales
 from mbdpg.interfaces import Batch, EnvSpec, Metrics, Phase, Sampling, Statistics
 from mbdpg.networks.critic import Critics
+from mbdpg.networks.mlp import Slopes
 from mbdpg.networks.normalizer import Normalizer
 from mbdpg.networks.policy import Policy
 
@@ -119,29 +120,27 @@ class MBDPG:
         window = state.window(batch)
         start_key, target_key, model_key = jax.random.split(key, 3)
         start = self._start(state, window, key=start_key)
-        gradient, (imagined, metrics) = jax.grad(self._actor_loss, has_aux=True)(state.actor, state, start, model_key)
+        real = window.observation[:, -1], window.action[:, -1]
+        gradient, (imagined, slopes, metrics) = jax.grad(self._actor_loss, has_aux=True)(
+            state.actor, state, real, start, model_key
+        )
         imagined = jax.lax.stop_gradient(imagined)
         targets = self._targets(state, window, start, imagined, key=target_key)
-
-        # One call for real and imagined steps: each call packs all weights anew.
-        observations = jnp.concatenate([window.observation[:, -1][None], imagined.observations[:-1]])
-        actions = jnp.concatenate([window.action[:, -1][None], imagined.actions[:-1]])
         weights = imagined.survival()[:-1] * start.weight[None]
 
-        def loss(critics: Critics) -> tuple[Array, Array]:
-            values = critics(observations, actions)
-            real, along = values[:, 0], values[:, 1:]
-            total = objectives.critic_loss(real, targets[0], jnp.ones_like(targets[0]))
-            total += c.imagined_weight * objectives.critic_loss(along, targets[1], weights)
-            return total, real
+        def loss(values: Array) -> Array:
+            total = objectives.critic_loss(values[:, 0], targets[0], jnp.ones_like(targets[0]))
+            return total + c.imagined_weight * objectives.critic_loss(values[:, 1:-1], targets[1], weights)
 
-        (critic_loss, real), critic_gradient = jax.value_and_grad(loss, has_aux=True)(state.critics)
+        values = slopes.output.reshape(-1, c.horizon + 2, *start.weight.shape)
+        critic_loss, errors = jax.value_and_grad(loss)(values)
+        critic_gradient = state.critics.weighed(slopes, errors)
         state = self._step_actor(self._step_critics(state, critic_gradient), gradient)
         if c.imagination_ratio > 0.0:
             state = eqx.tree_at(lambda x: x.imagined, state, self._store(state.imagined, start, imagined))
         return state, metrics | {
             "critic/loss": critic_loss,
-            "critic/q_mean": jnp.mean(real) * state.return_scale,
+            "critic/q_mean": jnp.mean(values[:, 0]) * state.return_scale,
             "critic/grad_norm": optax.tree.norm(critic_gradient),
             "critic/skipped": state.critic_optimizer.total_notfinite,
             "actor/grad_norm": optax.tree.norm(gradient),
@@ -155,10 +154,11 @@ class MBDPG:
         A return follows what was done while it resembles what the policy does, as in Retrace (Munos et al. 2016).
         """
         steps = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), state.window(batch))
-        values = self._target_value(state, jnp.concatenate([steps.observation[:1], steps.next_observation]), key=key)
-        chosen = state.actor(steps.observation)
-        alike = steps.valid * objectives.likeness(steps.action, chosen, self.config.grounding_tolerance)
-        trace = jnp.concatenate([alike[1:], jnp.zeros_like(alike[:1])])  # whether to follow the next step
+        values = self._target_value(state, steps.next_observation, key=key)
+        after = jax.tree.map(lambda x: x[1:], steps)
+        alike = objectives.likeness(after.action, state.actor(after.observation), self.config.grounding_tolerance)
+        # Whether to follow the next step; after the last there is none.
+        trace = jnp.concatenate([after.valid * alike, jnp.zeros_like(steps.valid[:1])])
         rewards, continues = state.real_reward(steps), 1.0 - steps.terminated
         targets = objectives.expanded_values(rewards, continues, values, self.config.discount, trace)
 
@@ -166,7 +166,7 @@ class MBDPG:
             return objectives.critic_loss(critics(steps.observation, steps.action), targets, steps.valid)
 
         value, gradient = jax.value_and_grad(loss)(state.critics)
-        following = jnp.maximum(jnp.sum(steps.valid[1:]), 1.0)  # steps that might be followed
+        following = jnp.maximum(jnp.sum(after.valid), 1.0)  # steps that might be followed
         metrics = {"critic/grounding_loss": value, "critic/grounding_trace": jnp.sum(trace) / following}
         return self._step_critics(state, gradient), metrics
 
@@ -218,9 +218,13 @@ class MBDPG:
         return jax.tree.map(lambda m, r: jnp.where(use.reshape((-1,) + (1,) * (r.ndim - 1)), m, r), model, real)
 
     def _actor_loss(
-        self, actor: Policy, state: State, start: Start, key: PRNGKeyArray
-    ) -> tuple[Array, tuple[Trajectory, Metrics]]:
-        """-J of Eq. 18 in units of the values' size; its derivative is Eq. 19 where `gradient` says so."""
+        self, actor: Policy, state: State, real: tuple[Array, Array], start: Start, key: PRNGKeyArray
+    ) -> tuple[Array, tuple[Trajectory, Slopes, Metrics]]:
+        """-J of Eq. 18 in units of the values' size; its derivative is Eq. 19 where `gradient` says so.
+
+        Beside it, for the critics to learn from: the trajectories, and the critics' slopes at the observations and
+        actions `real` and then along those.
+        """
         c = self.config
         printed = c.gradient == "eq19"
         imagined = imagine(
@@ -233,9 +237,12 @@ class MBDPG:
             detach_policy_input=printed,
             key=key if c.planning == "stochastic" else None,
         )
-        seen = imagined.observations[c.first_value :]
-        seen = jax.lax.stop_gradient(seen) if printed else seen
-        values = objectives.climbed_value(state.critics(seen, imagined.actions[c.first_value :]), c.actor_value)
+        seen = jax.lax.stop_gradient(imagined.observations) if printed else imagined.observations
+        # One call for real and imagined steps: each call packs all weights anew.
+        observations = jnp.concatenate([real[0][None], seen])
+        actions = jnp.concatenate([real[1][None], imagined.actions])
+        values, slopes = state.critics.with_slopes(observations, actions)
+        values = objectives.climbed_value(values[:, 1 + c.first_value :], c.actor_value)
         values = values if c.terminal_value else jnp.zeros_like(values)
         survival = imagined.survival()
         survival = jax.lax.stop_gradient(survival) if printed else survival
@@ -247,7 +254,7 @@ class MBDPG:
         size = jax.lax.stop_gradient(jnp.maximum(jnp.sum(jnp.abs(objective) * start.weight) / count, 1.0))
         saturation = jnp.sum(jnp.mean(jnp.square(actor.mlp(start.observation)), axis=-1) * start.weight) / count
         metrics = {"actor/objective": mean, "actor/saturation": saturation, "actor/survival": jnp.mean(survival[-1])}
-        return c.saturation_penalty * saturation - mean / size, (imagined, metrics)
+        return c.saturation_penalty * saturation - mean / size, (imagined, slopes, metrics)
 
     def _targets(
         self, state: State, window: Window, start: Start, imagined: Trajectory, *, key: PRNGKeyArray
@@ -259,7 +266,7 @@ class MBDPG:
         seen = imagined.observations if c.trace < 1.0 else imagined.observations[-1:]
         values = self._target_value(state, seen, key=noise_key)
         values = jnp.broadcast_to(values, imagined.observations.shape[:-1])
-        expanded = objectives.expanded_values(imagined.rewards, imagined.continues, values, c.discount, c.trace)
+        expanded = objectives.expanded_values(imagined.rewards, imagined.continues, values[1:], c.discount, c.trace)
         # The real step is the expansion's first, and without a horizon its only one.
         after = (1.0 - c.trace) * values[0] + c.trace * expanded[0] if c.horizon > 0 else values[0]
         if c.imagination_ratio > 0.0:  # where imagination went on from elsewhere, the transition has one step
