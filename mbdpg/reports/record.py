@@ -55,26 +55,13 @@ class Record(NamedTuple):
         return numbers(self.evaluations, name)
 
     def hours(self) -> dict[int, float]:
-        """Hours of training by environment steps, wherever a row has them.
-
-        Every process counts from its own start, so where a counter falls the run was resumed: what was counted until
-        then is added. What a process did after its last checkpoint is lost, here too.
-        """
-        rows: dict[int, dict[str, float]] = {}
+        """Hours of training by environment steps, wherever a row has them."""
+        found: dict[int, float] = {}
         for columns in (self.evaluations, self.training):
-            for name in (name for name in columns if name.startswith("time/")):
-                for step, value in zip(columns["env_steps"], numbers(columns, name), strict=True):
-                    if value is not None:  # of two rows of a step, the later one
-                        row = rows.setdefault(step, {})
-                        row[name] = max(value, row.get(name, value))
-        found, before, last = {}, 0.0, dict[str, float]()
-        for step in sorted(rows):
-            if any(value < last.get(name, value) for name, value in rows[step].items()):
-                before += last.get("time/seconds", 0.0)
-            last = rows[step]
-            if "time/seconds" in last:
-                found[step] = (before + last["time/seconds"]) / 3600
-        return found
+            for step, seconds in zip(columns["env_steps"], numbers(columns, "time/seconds"), strict=True):
+                if seconds is not None:  # of two rows of a step, the later one
+                    found[step] = max(seconds / 3600, found.get(step, 0.0))
+        return dict(sorted(found.items()))
 
     def problems(self) -> list[str]:
         """What did not go as planned, a phrase each."""

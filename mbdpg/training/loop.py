@@ -127,6 +127,7 @@ class Training:
                 "recorded": self._recorded,
                 "expert_env_steps": self._expert_env_steps,
                 "demonstrated": collector.replay.demonstrated,
+                "clock": self._clock(),
             }
             recorder.save_checkpoint(self.env_steps, self.learner.snapshot(index), facts, collector.replay.columns())
 
@@ -139,6 +140,9 @@ class Training:
         self._recorded = facts[0]["recorded"]
         self._expert_env_steps = facts[0]["expert_env_steps"]
         self._sums = [dict(fact["sums"]) for fact in facts]
+        clock = facts[0]["clock"]
+        self._began -= float(clock["time/seconds"])
+        self._seconds = {name: float(clock[f"time/{name}"]) for name in self._seconds}
         for collector, fact in zip(self.collectors, facts, strict=True):
             collector.restore(fact["collector"])
 
@@ -255,6 +259,6 @@ class Training:
             self._sums[index] = {}
 
     def _clock(self) -> Metrics:
-        """Seconds since this process began the run, and where they went."""
+        """Seconds of all processes that worked on the run, up to the checkpoints it went on from, and their parts."""
         parts = {f"time/{name}": seconds for name, seconds in self._seconds.items()}
         return {"time/seconds": time.monotonic() - self._began} | parts

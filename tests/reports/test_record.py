@@ -10,14 +10,12 @@ from mbdpg.reports.record import Record, number
 Make = Callable[..., Path]
 
 
-def test_hours_go_on_after_a_resume(tmp_path: Path, make: Make) -> None:
-    first = {0: {"time/seconds": 10.0, "time/acting": 0.0}, 100: {"time/seconds": 3600.0, "time/acting": 9.0}}
-    # The second process was slow to begin: only what it spent on acting tells that it is another.
-    second = {200: {"time/seconds": 4000.0, "time/acting": 2.0}, 300: {"time/seconds": 7200.0, "time/acting": 3.0}}
-    training = {100: {"time/seconds": 3601.0, "time/acting": 9.0}}
-    run = make(tmp_path / "a", dict.fromkeys((0, 100, 200, 300), 1.0), evaluations=first | second, training=training)
+def test_hours_are_those_of_the_later_row_of_a_step(tmp_path: Path, make: Make) -> None:
+    evaluations = {0: {"time/seconds": 10.0}, 100: {"time/seconds": 3600.0}}
+    training = {50: {"time/seconds": 1800.0}, 100: {"time/seconds": 3601.0}}
+    run = make(tmp_path / "a", dict.fromkeys((0, 100), 1.0), evaluations=evaluations, training=training)
     hours = Record.read(run, root=tmp_path).hours()
-    assert hours == pytest.approx({0: 10 / 3600, 100: 3601 / 3600, 200: 7601 / 3600, 300: 10801 / 3600})
+    assert hours == pytest.approx({0: 10 / 3600, 50: 0.5, 100: 3601 / 3600}) and list(hours) == [0, 50, 100]
 
 
 def test_without_timings_there_are_no_hours(tmp_path: Path, make: Make) -> None:

@@ -149,7 +149,8 @@ def test_a_run_stopped_anywhere_and_resumed_equals_one_that_was_not(whole: Any, 
         expected.checkpoints[-1],
     )
     assert bytes_of(arrays) == bytes_of(arrays_whole)
-    assert facts == facts_whole
+    assert facts.pop("clock").keys() == facts_whole["clock"].keys()
+    assert facts == {name: fact for name, fact in facts_whole.items() if name != "clock"}
     assert bytes_of(columns) == bytes_of(columns_whole)
 
 
@@ -319,6 +320,25 @@ def test_seconds_never_run_backwards_though_somebody_sets_the_clock(toy: Any, mo
     training, _ = toy.toy_training([0])
     run(training)
     assert len(seconds) > 5 and seconds == sorted(seconds) and seconds[0] >= 0
+
+
+def test_the_clock_of_a_resumed_run_goes_on_where_it_was_saved(toy: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    training, (recorder,) = toy.toy_training([0])
+    run(training, lambda: training.env_steps >= 16)
+    env_steps, arrays, facts, columns = recorder.checkpoints[-1]
+    later = {name: seconds + 3600 for name, seconds in facts["clock"].items()}
+    clocks: list[dict[str, float]] = []
+    monkeypatch.setattr(
+        toy.ToyRecorder,
+        "write",
+        lambda self, kind, steps, values: clocks.append({k: v for k, v in values.items() if k.startswith("time/")}),
+    )
+    training, _ = toy.toy_training([0], replay=Replay.from_columns(columns))
+    training.restore(env_steps, [arrays], [facts | {"clock": later}])
+    run(training)
+    assert len(clocks) > 2 and clocks[0].keys() == later.keys()
+    for before, after in itertools.pairwise([later, *clocks]):
+        assert all(before[name] <= after[name] < before[name] + 600 for name in before)
 
 
 def test_evaluation_is_a_plain_tuple_of_what_a_callback_needs(whole: Any) -> None:
