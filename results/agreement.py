@@ -62,6 +62,8 @@ def rows_of_run(path: Path) -> list[dict[str, str]]:
 
 def main(paths: list[Path]) -> None:
     """Collect, write, compare."""
+    if not paths:
+        raise SystemExit("nothing to compare; expected the files of benchmarks/peers.py and run folders")
     if any(path.resolve() == OUT for path in paths):
         raise SystemExit(f"{OUT.name} is what is written, expected the files of benchmarks/peers.py and run folders")
     rows = [row for path in paths for row in (rows_of_peer(path) if path.suffix == ".csv" else rows_of_run(path))]

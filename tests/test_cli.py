@@ -17,7 +17,6 @@ import pytest
 
 import mbdpg
 from mbdpg.cli import VERBS, main
-from mbdpg.cli.places import Places
 from mbdpg.experiments import expert
 from mbdpg.experiments.pool import Local
 from mbdpg.storage import RunFolder
@@ -347,6 +346,7 @@ def test_demonstrations_that_cannot_be_are_refused_before_an_expert_is_trained(s
         (("figure-6", "--seeds", "-1"), "--seeds are (-1,), expected from 0 to 2^31 - 1"),
         (("figure-6", "--seeds", "1", "1"), "--seeds are (1, 1), expected different ones"),
         (("figure-6", "--address", "127.0.0.1:6379"), "--address, --gpus need --engine ray"),
+        (("figure-6", "--engine", "ray", "--workers", "2"), "--workers is for this machine alone"),
         (("figure-6", "--out", "file"), "file cannot be a folder of studies"),
     ],
     ids=str,
@@ -386,7 +386,7 @@ def test_a_study_that_is_stopped_says_how_to_go_on(say: Any, monkeypatch: pytest
     monkeypatch.setattr("mbdpg.cli.reproduce.reproduce_study", stopped)
     said = say("reproduce", "figure-8", "--scale", "smoke", "--seeds", "3")
     assert said == Said(143, "", "mbdpg: saved; go on with: mbdpg reproduce figure-8 --scale smoke --seeds 3\n")
-    assert given == ["figure-8", "smoke", Path.cwd() / "studies" / "smoke", Local(Places().workers)]
+    assert given == ["figure-8", "smoke", Path.cwd() / "studies" / "smoke", Local()]
 
 
 def test_an_expert_of_another_environment_is_refused(say: Any, trained: Path) -> None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from mbdpg.experiments.cluster import Ray
 from mbdpg.experiments.launch import Engine
-from mbdpg.experiments.pool import Local, cores
+from mbdpg.experiments.pool import Local
 from mbdpg.interfaces import UserError, require
 
 
@@ -19,8 +18,8 @@ class Places:
 
     engine: Literal["local", "ray"] = "local"
     """Where runs are made: on this machine, or on a Ray cluster."""
-    workers: int = len(cores()) or os.cpu_count() or 1
-    """Runs at once on this machine; each has its share of the cores."""
+    workers: int | None = None
+    """Runs at once on this machine, by default one per core; each has its share of the cores."""
     address: str | None = None
     """Of a Ray cluster whose nodes share the file system, as in 10.0.0.1:6379; by default one is begun here."""
     gpus: bool = False
@@ -53,4 +52,7 @@ def engine_of(places: Places) -> Engine:
     """
     ray = places.engine == "ray"
     require(ray or (places.address is None and not places.gpus), "--address, --gpus need --engine ray")
-    return Ray(places.address, places.gpus) if ray else Local(places.workers)
+    require(not ray or places.workers is None, "--workers is for this machine alone, not for --engine ray")
+    if ray:
+        return Ray(places.address, places.gpus)
+    return Local() if places.workers is None else Local(places.workers)

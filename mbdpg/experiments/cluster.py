@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from mbdpg.experiments.launch import ATTEMPTS, PLATFORM, POLL_SECONDS, Work, environment, log_of
-from mbdpg.interfaces import UserError, require
+from mbdpg.interfaces import UserError, one_line, require
 
 LOOPBACK = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
 """0 has Ray listen on loopback alone, else on all interfaces. It reads it as it is imported: once in a process."""
@@ -50,8 +50,10 @@ class Ray:
                     work = running.pop(reference)
                     try:
                         problem = ray.get(reference)
+                    except ray.exceptions.RayTaskError as error:  # its own text begins with where, in colors
+                        problem = f"{type(error.cause).__name__}: {one_line(str(error.cause))}"
                     except ray.exceptions.RayError as error:
-                        problem = f"{type(error).__name__}: {str(error).splitlines()[0]}"
+                        problem = f"{type(error).__name__}: {one_line(str(error))}"
                     if problem:
                         failures[work.name] = problem
                     if problem or work.finished():
@@ -64,7 +66,7 @@ class Ray:
 
 def _as_task(work: Work, log: Path, stop_file: Path) -> str | None:
     """Do it, in a worker of Ray's; returns why it failed, if it did."""
-    if work.finished():  # by an attempt whose worker died afterwards
+    if stop_file.exists() or work.finished():  # the latter by an attempt whose worker died afterwards
         return None
     with open(log, "a", encoding="utf-8") as file, contextlib.redirect_stdout(file), contextlib.redirect_stderr(file):
         try:

@@ -54,7 +54,7 @@ class ModelFit:
     data: Path
     """Run folder whose steps are learned from."""
     data_steps: int
-    """That it must have."""
+    """Its first so many are learned from and tested on."""
     seed: int
     out: Path
     """CSV file: depth, root mean square error, and that of persistence, in standard deviations of the observation."""
@@ -79,7 +79,7 @@ class ModelFit:
         keep_compilations()
         there = steps_evaluated(self.data)
         require(there >= self.data_steps, f"{self.data} has {there:,} of {self.data_steps:,} steps to learn from yet")
-        config, steps = RunConfig.from_json(RunFolder.open(self.data).config), Recorded.load(self.data)
+        config, steps = RunConfig.from_json(RunFolder.open(self.data).config), Recorded.load(self.data, self.data_steps)
         env = config.make_env()
         agent, rng = MBDPG(self.agent, env.spec), np.random.default_rng(self.seed)
         env.close()
@@ -132,13 +132,13 @@ class Recorded:
     """Rows that `STEPS` further ones of their episode follow."""
 
     @classmethod
-    def load(cls, run: Path) -> Recorded:
-        """Read them from the run's newest checkpoint.
+    def load(cls, run: Path, steps: int) -> Recorded:
+        """Read the first so many from the run's newest checkpoint: it may have been trained for longer.
 
         Raises:
             UserError: there are too few long episodes.
         """
-        replay = Replay.from_columns(load_checkpoint(run).replay)
+        replay = Replay.from_columns({name: column[:steps] for name, column in load_checkpoint(run).replay.items()})
         start = replay.columns()["start"]
         starts, episode = np.unique(start, return_inverse=True)
         held_out = episode % HELD_OUT == HELD_OUT - 1

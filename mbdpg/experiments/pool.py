@@ -29,11 +29,16 @@ ALIVE = "alive"
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
+def cores() -> list[int]:
+    """Those that this process may use; none where nobody says."""
+    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+
+
 @dataclass(frozen=True)
 class Local:
     """This machine: processes that share its cores evenly, each held to its own."""
 
-    workers: int
+    workers: int = len(cores()) or os.cpu_count() or 1
 
     def __post_init__(self) -> None:
         require(self.workers >= 1, f"--workers is {self.workers}, expected at least 1")
@@ -44,11 +49,6 @@ class Local:
         """See `launch`."""
         _await_orphans(logs, say, should_stop)
         return _Pool(self.workers, logs, say).run(works, should_stop)
-
-
-def cores() -> list[int]:
-    """Those that this process may use; none where nobody says."""
-    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
 
 
 def _await_orphans(logs: Path, say: Callable[[str], None], should_stop: Callable[[], bool]) -> None:
@@ -117,7 +117,7 @@ class _Pool:
         return f"its process died ({signal.Signals(-status).name if status < 0 else f'status {status}'})"
 
     def _start(self, work: Work, cores: list[int]) -> None:
-        process = self._context.Process(target=_in_process, args=(work, cores, log_of(work, self._logs)))
+        process = self._context.Process(target=_in_process, args=(os.getpid(), work, cores, log_of(work, self._logs)))
         own = dict.fromkeys(THREADS, str(max(len(cores), 1)))
         with environment(own | {PLATFORM: os.environ.get(PLATFORM, "cpu")}):
             process.start()
@@ -132,8 +132,8 @@ class _Pool:
         return ended
 
 
-def _in_process(work: Work, cores: list[int], log: Path) -> None:
-    parent = os.getppid()
+def _in_process(parent: int, work: Work, cores: list[int], log: Path) -> None:
+    """Do it, unless and until the parent is gone, be it before this process had read what its work is."""
     with open(log, "a", encoding="utf-8") as file, open(log.with_name(ALIVE), "ab") as alive, Stop() as stop:
         fcntl.flock(alive, fcntl.LOCK_SH)
         for stream in (1, 2):

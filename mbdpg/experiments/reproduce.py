@@ -12,7 +12,7 @@ from mbdpg.experiments.cluster import Ray
 from mbdpg.experiments.config import RunConfig
 from mbdpg.experiments.launch import Engine, Work, launch
 from mbdpg.experiments.model_study import ModelFit, is_whole
-from mbdpg.experiments.studies import RECORDED, SCALES, Cell, Model, Scale, ScaleName, Study, StudyName, study
+from mbdpg.experiments.studies import SCALES, Cell, Model, Scale, ScaleName, Study, StudyName, study
 from mbdpg.experiments.work import Demonstrating, Training, origin_of
 from mbdpg.interfaces import require
 from mbdpg.reports.figures import write_figure
@@ -53,8 +53,8 @@ def reproduce(
     together = isinstance(engine, Ray) and engine.gpus
     groups = [scale.seeds] if together else [(seed,) for seed in scale.seeds]
     first, then = _works(chosen, scale, groups, out)
-    claim = f"The paper says: {chosen.claim}"
-    say(f"{name}: {claim}")
+    heading = [f"`{_command(name, scale_name, seeds, engine)}`", f"The paper says: {chosen.claim}"]
+    say(f"{name}: {heading[-1]}")
     failures: dict[str, str] = {}
     with only_writer(out):
         for works in (first, then):
@@ -63,7 +63,9 @@ def reproduce(
             failures |= launch(works, engine, logs=out / "logs", say=say, should_stop=should_stop)
             if should_stop():
                 return
-        _draw(chosen, scale, out, [f"`{_command(name, scale_name, seeds, engine)}`", claim], say)
+        if failures:
+            heading.append(f"Not here, for they failed: {'; '.join(sorted(failures))}.")
+        _draw(chosen, scale, out, heading, say)
     logs, count = out / "logs", len(first) + len(then)
     require(not failures, f"{len(failures)} of {count} failed (see {logs}); the figure lacks them")
 
@@ -83,16 +85,15 @@ def _works(chosen: Study, scale: Scale, groups: Sequence[tuple[int, ...]], out: 
             for seeds in groups:
                 add(then, _training(cell, seeds, scale, out))
         for model in panel.models:
-            recorded = Training(
-                _teacher(RunConfig(RECORDED), scale.recorded_steps, scale), (0,), out / RECORDED / "recorded"
-            )
+            teacher = _teacher(RunConfig(model.env), scale.recorded_steps, scale)
+            recorded = Training(teacher, (0,), out / model.env / "recorded")
             add(first, recorded)
             for seed in scale.seeds:
                 file = _errors_file(model, seed, out)
                 data = recorded.out / "seed-0"
                 given = (model.agent, scale.model_updates, data, scale.recorded_steps, seed, file)
                 fitting = (*given, model.aggregation, model.members)
-                add(then, ModelFit(model.label, *fitting))
+                add(then, ModelFit(f"{model.env} {model.label}", *fitting))
     return list(first.values()), list(then.values())
 
 
@@ -115,7 +116,7 @@ def _teacher(like: RunConfig, steps: int, scale: Scale) -> RunConfig:
 
 
 def _errors_file(model: Model, seed: int, out: Path) -> Path:
-    return out / "models" / model.label.replace(" ", "-") / f"seed-{seed}.csv"
+    return out / model.env / "models" / model.label.replace(" ", "-") / f"seed-{seed}.csv"
 
 
 def _command(name: StudyName, scale_name: ScaleName, seeds: Sequence[int], engine: Engine) -> str:
@@ -127,7 +128,7 @@ def _command(name: StudyName, scale_name: ScaleName, seeds: Sequence[int], engin
 
 
 def _draw(chosen: Study, scale: Scale, out: Path, heading: Sequence[str], say: Callable[[str], None]) -> None:
-    """The study's figure, its numbers as CSV and its tables, from whatever is there."""
+    """The study's figure, its numbers as CSV and its tables, from whatever is finished."""
     panels: list[Curves | Errors] = []
     for panel in chosen.panels:
         if panel.models:
@@ -137,8 +138,8 @@ def _draw(chosen: Study, scale: Scale, out: Path, heading: Sequence[str], say: C
                 files[model.label] = {file: origin_of(file) for file in whole}
             panels.append(Errors(panel.title, {label: found for label, found in files.items() if found}))
         else:
-            begun = {cell.label: _training(cell, scale.seeds, scale, out).begun() for cell in panel.cells}
-            runs = {label: [Record.read(run, root=out) for run in found] for label, found in begun.items()}
+            done = {cell.label: _training(cell, scale.seeds, scale, out).done() for cell in panel.cells}
+            runs = {label: [Record.read(run, root=out) for run in found] for label, found in done.items()}
             shown = {label: found for label, found in runs.items() if found}
             panels.append(Curves(panel.title, shown, panel.published_hours))
     for line in write_figure(chosen.name, panels, out, heading=heading, as_hours=chosen.as_hours):

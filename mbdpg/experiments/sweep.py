@@ -8,6 +8,7 @@ import json
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import starmap
 from pathlib import Path
 from typing import Any, Literal, final
 
@@ -175,8 +176,8 @@ def returns(training: Training) -> Curve:
 
 
 def score(training: Training) -> float:
-    """Mean over seeds and the last evaluations: what is maximized."""
-    return float(np.mean([*returns(training).values()][-LAST:]))
+    """Mean over seeds and the last evaluations with anything done before: what is maximized."""
+    return float(np.mean([value for step, value in returns(training).items() if step > 0][-LAST:]))
 
 
 def opened(out: Path, seed: int = 0, warm_up: int = 0) -> Any:
@@ -197,9 +198,10 @@ def opened(out: Path, seed: int = 0, warm_up: int = 0) -> Any:
 def _conclude(works: Sequence[Trial], out: Path, say: Callable[[str], None]) -> None:
     optuna, study = _optuna(), opened(out)
     done = [trial for trial in study.trials if trial.state == optuna.trial.TrialState.COMPLETE]
-    require(bool(done), f"no trial was completed, see {out / 'logs'}")
     notes = [work.note() for work in works]
     values = {trial.number: trial.value for trial in done}
+    scored = [note for note in notes if note.get("trial") in values]
+    require(bool(scored), f"no trial was completed, see {out / 'logs'}")
     names = [search.name for search in works[0].searches]
     rows: list[Sequence[Any]] = [("trial", "state", "score", *names)]
     for number, note in enumerate(notes):
@@ -208,10 +210,16 @@ def _conclude(works: Sequence[Trial], out: Path, say: Callable[[str], None]) -> 
     replace_table(out / "sweep.csv", rows)
     completed = sum(note.get("state") == "complete" for note in notes)
     say(f"{completed} of {len(works)} trials completed; all of them in {out / 'sweep.csv'}")
-    best = max((note for note in notes if note.get("trial") in values), key=lambda note: values[note["trial"]])
-    flags = " ".join(f"{flag_of(name)} {value}" for name, value in best["settings"].items())
-    say(f"best, {values[best['trial']]:,.1f}: {flags}")
+    best = max(scored, key=lambda note: values[note["trial"]])
+    say(f"best, {values[best['trial']]:,.1f}: {' '.join(starmap(_as_flag, best['settings'].items()))}")
     _draw(study, done, out, say)
+
+
+def _as_flag(name: str, value: Any) -> str:
+    """What to give `mbdpg train` for a setting."""
+    if isinstance(value, bool):
+        return flag_of(name if value else f"no_{name}")
+    return f"{flag_of(name)} {value}"
 
 
 def _draw(study: Any, done: Sequence[Any], out: Path, say: Callable[[str], None]) -> None:

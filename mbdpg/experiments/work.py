@@ -42,7 +42,7 @@ class Training:
 
     def finished(self) -> bool:
         """Whether every seed has all its steps and its last evaluation, with these settings."""
-        return all(self._has(run, self.config.schedule.steps) for run in self.runs())
+        return self.done() == self.runs()
 
     def __call__(self, should_stop: Callable[[], bool], on_update: OnUpdate = lambda update: None) -> None:
         """Begin, or go on where it was.
@@ -60,23 +60,24 @@ class Training:
                 require(same, f"{run} has other settings than this one's; move it away, or choose another --out")
                 if steps_evaluated(run) < steps:
                     begun.append(run)
-        resume(begun, steps=steps, watch=lambda *_: on_update, should_stop=should_stop)
+        allowed = self.config.env_options.allow_import
+        resume(begun, steps=steps, allow_import=allowed, watch=lambda *_: on_update, should_stop=should_stop)
         fresh = [seed for seed, run in zip(self.seeds, self.runs(), strict=True) if not run.exists()]
         if fresh and not should_stop():
             train(self.config, seeds=fresh, out=self.out, on_update=on_update, should_stop=should_stop)
 
-    def begun(self) -> list[Path]:
-        """Run folders with these settings that have something to show."""
-        return [run for run in self.runs() if self._has(run, 1)]
+    def done(self) -> list[Path]:
+        """The run folders that are finished."""
+        return [run for run in self.runs() if self._is_done(run)]
 
     def runs(self) -> list[Path]:
         """All run folders, begun or not."""
         return [self.out / f"seed-{seed}" for seed in self.seeds]
 
-    def _has(self, run: Path, steps: int) -> bool:
-        """Whether a run with these settings was evaluated at so many steps or more; not a damaged one."""
+    def _is_done(self, run: Path) -> bool:
+        """Whether a run with these settings was evaluated at its last step; not a damaged one."""
         try:
-            return steps_evaluated(run) >= steps and _is_of(run, self.config)
+            return steps_evaluated(run) >= self.config.schedule.steps and _is_of(run, self.config)
         except UserError:  # going on with it says what is wrong
             return False
 

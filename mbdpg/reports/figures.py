@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from mbdpg.reports.panels import Curves, Errors, Panels
 from mbdpg.reports.record import shared_steps
-from mbdpg.reports.statistics import summarize
+from mbdpg.reports.statistics import sample_std, summarize
 from mbdpg.reports.tables import Groups, tables
 from mbdpg.storage.files import replace_durably, replace_table
 
@@ -96,15 +96,17 @@ def _picture(panels: Panels) -> bytes:
 
 def _draw_errors(axes: Any, panel: Errors) -> None:
     tables = panel.tables()
+    axes.set(xlabel="open-loop steps", ylabel="error, observation standard deviations", title=panel.title)
+    if not tables:
+        return
     for number, (label, table) in enumerate(tables.items()):
         depth, errors = table[0, :, 0], table[:, :, 1]
-        axes.plot(depth, errors.mean(axis=0), color=f"C{number}", label=f"{label} ({_seeds(table)})")
-        mean, spread = errors.mean(axis=0), errors.std(axis=0, ddof=1) if len(errors) > 1 else 0.0
-        low, high = mean - spread, mean + spread
+        mean, std = errors.mean(axis=0), sample_std(errors)
+        axes.plot(depth, mean, color=f"C{number}", label=f"{label} ({_seeds(table)})")
+        low, high = mean - std, mean + std
         axes.fill_between(depth, low, high, color=f"C{number}", alpha=0.2, linewidth=0)
     for table in [*tables.values()][:1]:
         axes.plot(table[0, :, 0], table[:, :, 2].mean(axis=0), color="gray", linestyle=":", label="no change at all")
-    axes.set(xlabel="open-loop steps", ylabel="error, observation standard deviations", title=panel.title)
     axes.grid(alpha=0.3)
     axes.legend(fontsize="small")
 
@@ -129,8 +131,8 @@ def _draw_curves(
 
 
 def _mean_and_std(returns: list[float]) -> tuple[float, float, float]:
-    mean, spread = float(np.mean(returns)), float(np.std(returns, ddof=1)) if len(returns) > 1 else 0.0
-    return mean, mean - spread, mean + spread
+    mean, std = float(np.mean(returns)), float(sample_std(np.asarray(returns)))
+    return mean, mean - std, mean + std
 
 
 def _interquartile(returns: list[float]) -> tuple[float, float, float]:

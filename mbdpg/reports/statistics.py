@@ -44,6 +44,11 @@ def interquartile_mean(scores: np.ndarray) -> np.ndarray:
     return np.asarray(ordered[..., cut : ordered.shape[-1] - cut].mean(axis=-1))
 
 
+def sample_std(scores: np.ndarray) -> np.ndarray:
+    """Along the first axis, with n - 1 below; 0 of a single score, to draw no band around it."""
+    return np.asarray(scores.std(axis=0, ddof=1 if len(scores) > 1 else 0))
+
+
 def probability_of_improvement(scores: Sequence[float], others: Sequence[float]) -> float:
     """How often a run drawn from `scores` is better than one from `others`, a tie counting half (Mann and Whitney)."""
     ours, theirs = np.asarray(scores)[:, None], np.asarray(others)[None]

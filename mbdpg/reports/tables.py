@@ -11,7 +11,7 @@ from mbdpg.reports.comparison import cells
 from mbdpg.reports.differences import commit, machine
 from mbdpg.reports.panels import Curves, Errors, Evaluation, Panels
 from mbdpg.reports.record import shared_steps
-from mbdpg.reports.statistics import summarize
+from mbdpg.reports.statistics import sample_std, summarize
 
 DEPTHS = (1, 10, 50, 200)
 """Imagined steps whose error is shown."""
@@ -68,8 +68,8 @@ def _errors(panel: Errors) -> Table:
     depths = [depth for depth in DEPTHS if all(depth <= errors.shape[1] for errors in found.values())]
     table = [["error (standard deviations) after", "seeds", *(f"{depth} step{'s' * (depth > 1)}" for depth in depths)]]
     for label, errors in found.items():
-        mean, spread = errors[:, :, 1].mean(axis=0), errors[:, :, 1].std(axis=0, ddof=1 if len(errors) > 1 else 0)
-        parts = [f"{mean[i - 1]:.3f}" + f" ± {spread[i - 1]:.3f}" * (len(errors) > 1) for i in depths]
+        mean, std = errors[:, :, 1].mean(axis=0), sample_std(errors[:, :, 1])
+        parts = [f"{mean[i - 1]:.3f}" + f" ± {std[i - 1]:.3f}" * (len(errors) > 1) for i in depths]
         table.append([label, str(len(errors)), *parts])
     for errors in [*found.values()][:1]:  # the same for all, on the same steps
         table.append(["no change at all", "", *(f"{errors[:, i - 1, 2].mean():.3f}" for i in depths)])

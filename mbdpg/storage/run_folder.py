@@ -133,10 +133,14 @@ def only_writer(folder: Path) -> Iterator[None]:
 def discard_unbegun(path: Path) -> None:
     """Delete a run folder whose process died before its first checkpoint, when there was nothing to go on from.
 
+    One that died before it had written the config, or while it deleted such a folder, has left an empty one.
+
     Raises:
         UserError: it is no run folder, a process works in it, or it holds something that mbdpg did not write.
     """
-    with RunFolder.open(path).locked():
+    if not {entry.name for entry in path.iterdir()} <= {f"{TEMPORARY}{_CONFIG}", "lock"}:
+        RunFolder.open(path)
+    with only_writer(path):
         strange = [entry.name for entry in path.iterdir() if entry.name.removeprefix(TEMPORARY) not in _CONTENTS]
         strange += [entry.name for entry in (path / "checkpoints").glob("[0-9]*")]
         if strange:

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 import mbdpg
-from mbdpg.experiments.cluster import Ray
+from mbdpg.experiments.cluster import Ray, _as_task
 from mbdpg.experiments.launch import ATTEMPTS, launch
 from mbdpg.experiments.pool import ALIVE, Local
 from mbdpg.interfaces import UserError
@@ -26,6 +26,10 @@ PIECES = """
 import os, signal, time
 from dataclasses import dataclass
 from pathlib import Path
+
+if slow := os.environ.get("SLOW_TO_READ"):
+    Path(slow, f"{os.getpid()}.reading").touch()
+    time.sleep(1.5)
 
 @dataclass(frozen=True)
 class Piece:
@@ -134,14 +138,19 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.parametrize("how", ["all of its group are asked to end", "it is killed"])
+@pytest.mark.parametrize("how", ["all of its group are asked to end", "it is killed", "it is killed early"])
 def test_whatever_ends_the_launcher_its_pieces_save(piece: Any, tmp_path: Path, how: str) -> None:
+    """A piece that had not been read yet when its launcher died went on for ever."""
     (tmp_path / "launcher.py").write_text(LAUNCHER)
     paths = os.pathsep.join([str(tmp_path), str(Path(mbdpg.__file__).parent.parent)])
     command = [sys.executable, str(tmp_path / "launcher.py"), str(tmp_path)]
-    program = subprocess.Popen(command, env=os.environ | {"PYTHONPATH": paths}, start_new_session=True)
-    waited(lambda: piece("long").count() > 0)
-    if how == "it is killed":
+    environment = os.environ | {"PYTHONPATH": paths, "SLOW_TO_READ": str(tmp_path) if how.endswith("early") else ""}
+    program = subprocess.Popen(command, env=environment, start_new_session=True)
+    if how == "it is killed early":
+        waited(lambda: len(list(tmp_path.glob("*.reading"))) == 2)  # the launcher has read it, and now its piece does
+    else:
+        waited(lambda: piece("long").count() > 0)
+    if how.startswith("it is killed"):
         program.kill()
     else:
         os.killpg(program.pid, signal.SIGTERM)
@@ -165,6 +174,14 @@ def test_no_worker_and_no_ray_are_said_in_one_line(monkeypatch: pytest.MonkeyPat
         launch([piece("a")], Ray(), logs=tmp_path, say=lambda line: None)
 
 
+class TaskError(RuntimeError):
+    """Ray's, whose text begins with where it was raised."""
+
+    def __init__(self, cause: Exception):
+        super().__init__("\x1b[36mray::_as_task()\x1b[39m (pid=7, ip=127.0.0.1)\n  File ...")
+        self.cause = cause
+
+
 class Cluster:
     """In the place of the module `ray`: what it is asked for, and nothing done."""
 
@@ -173,6 +190,8 @@ class Cluster:
         self.problem: type[BaseException] | None = None
         """Raised where work is waited for."""
         self.refused = False
+        self.exceptions = type("Exceptions", (), {"RayError": RuntimeError, "RayTaskError": TaskError})
+        self.task_problem: Exception | None = None
 
     def init(self, address: str, **options: Any) -> None:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
@@ -192,6 +211,8 @@ class Cluster:
         return running, []
 
     def get(self, reference: Any) -> str:
+        if self.task_problem:
+            raise self.task_problem
         return "not done"
 
     def shutdown(self) -> None: ...
@@ -224,6 +245,23 @@ def test_a_cluster_that_refuses_leaves_signals_as_they_were(cluster: Cluster, pi
     with pytest.raises(UserError, match="where no Ray cluster answers: no"):
         launch([piece("a")], Ray(), logs=tmp_path, say=lambda line: None)
     assert signal.getsignal(signal.SIGTERM) == before
+
+
+def test_what_a_worker_raises_is_told_and_not_where(cluster: Cluster, piece: Any, tmp_path: Path) -> None:
+    """As of a node that does not share the file system."""
+    for problem, said in (
+        (TaskError(OSError("no such\nfolder")), "OSError: no such folder"),
+        (RuntimeError("the node died"), "RuntimeError: the node died"),
+    ):
+        cluster.task_problem = problem
+        assert launch([piece("a")], Ray(), logs=tmp_path / "logs", say=lambda line: None) == {"a": said}
+
+
+def test_work_that_waited_on_a_cluster_does_not_begin_after_a_stop(piece: Any, tmp_path: Path) -> None:
+    """Every trial of a sweep that was stopped chose its settings first."""
+    (tmp_path / "stop").touch()
+    assert _as_task(piece("a"), tmp_path / "log", tmp_path / "stop") is None and piece("a").count() == 0
+    assert _as_task(piece("a"), tmp_path / "log", tmp_path / "go") is None and piece("a").count() == 1
 
 
 def test_an_error_leaves_no_file_that_asks_to_stop(cluster: Cluster, piece: Any, tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ def recorded(monkeypatch: pytest.MonkeyPatch) -> Recorded:
             replay.add(before, action, 0.0, 0.5 * before + action, False, step == length - 1)
     saved = Checkpoint(0, {}, {}, replay.columns())
     monkeypatch.setattr(model_study, "load_checkpoint", lambda run: saved)
-    return Recorded.load(Path("run"))
+    return Recorded.load(Path("run"), sum(LENGTHS))
 
 
 def test_episodes_are_learned_from_or_tested_on(recorded: Recorded) -> None:
@@ -54,7 +54,14 @@ def test_a_bootstrap_sample_is_of_whole_episodes_learned_from(recorded: Recorded
 def test_too_short_episodes_are_refused_in_one_line(recorded: Recorded, monkeypatch: Any) -> None:
     monkeypatch.setattr(model_study, "STEPS", 13)
     with pytest.raises(UserError, match="run has no episode of 13 steps to test on .*; train it for longer"):
-        Recorded.load(Path("run"))
+        Recorded.load(Path("run"), sum(LENGTHS))
+
+
+def test_steps_that_a_run_was_resumed_for_are_not_among_those_of_a_study(recorded: Recorded) -> None:
+    """Models that were fitted before had learned from fewer, and were drawn beside them."""
+    first = Recorded.load(Path("run"), sum(LENGTHS[:8]))
+    assert first.replay.size == sum(LENGTHS[:8]) and set(first.learned) < set(recorded.learned)
+    assert list(first.tested) == list(recorded.tested)
 
 
 @pytest.mark.parametrize(

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import itertools
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import pytest
 
 from mbdpg.agents import td3
 from mbdpg.experiments import reproduce as module
-from mbdpg.experiments.config import RunConfig
+from mbdpg.experiments.config import EnvOptions, RunConfig
 from mbdpg.experiments.launch import Work
 from mbdpg.experiments.pool import Local
 from mbdpg.experiments.reproduce import reproduce
@@ -118,6 +120,25 @@ def test_a_damaged_run_fails_alone_and_is_left_as_it_is(launched: list[str], tmp
     assert damaged.read_text() == "{}\n" * 2
     found = {(row["label"], row["seed"]) for row in numbers(tmp_path)}
     assert found == {("td3", "1"), ("td3 width=5", "0"), ("td3 width=5", "1")}
+    assert "\n\nNot here, for they failed: Pendulum-v1 td3 seed 0.\n\n" in (tmp_path / "figure-8.md").read_text()
+
+
+def test_a_run_that_failed_in_the_middle_does_not_cut_the_others_short(
+    launched: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    half = dataclasses.replace(STUDY.panels[0].cells[0].config, schedule=dataclasses.replace(SCHEDULE, steps=20))
+    train(half, seeds=[0], out=tmp_path / "Pendulum-v1" / "td3")
+
+    def fails(runs: Sequence[Path], **others: Any) -> None:
+        if runs:
+            raise UserError("the disk is full")
+
+    monkeypatch.setattr("mbdpg.experiments.work.resume", fails)
+    with pytest.raises(UserError, match="1 of 4 failed"):
+        begin(tmp_path)
+    assert {(row["label"], row["seed"]) for row in numbers(tmp_path)} >= {("td3", "1")}
+    text = (tmp_path / "figure-8.md").read_text()
+    assert re.search(r"\| td3 +\| 1 +\| 40 ", text) and "they failed: Pendulum-v1 td3 seed 0." in text
 
 
 def test_an_expert_without_success_fails_alone(launched: list[str], tmp_path: Path, monkeypatch: Any) -> None:
@@ -147,6 +168,37 @@ def test_a_folder_that_is_no_run_is_never_deleted(launched: list[str], tmp_path:
     with pytest.raises(UserError, match="has no checkpoint, but has 'thesis.txt'; move it away"):
         dataclasses.replace(work, out=tmp_path / "other")(lambda: False)
     assert (seed / "thesis.txt").exists() and (run.path / "thesis.txt").exists()
+
+
+@pytest.mark.parametrize("left", [(), (".tmp-config.json",), (".tmp-config.json", "lock")])
+def test_a_run_that_died_before_its_config_was_there_is_begun_again(
+    launched: list[str], tmp_path: Path, left: tuple[str, ...]
+) -> None:
+    """It was refused as no run folder, every time."""
+    run = tmp_path / "td3" / "seed-0"
+    run.mkdir(parents=True)
+    for name in left:
+        (run / name).touch()
+    work = Training(STUDY.panels[0].cells[0].config, (0,), tmp_path / "td3")
+    work(lambda: False)
+    assert work.finished() and not (run / ".tmp-config.json").exists()
+
+
+def test_a_run_of_ones_own_task_goes_on_where_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, launched: list[str]
+) -> None:
+    """--allow-import was given, and not believed when a trial was begun again."""
+    (tmp_path / "own_task.py").write_text(
+        "import gymnasium\ngymnasium.registry['Own-v0'] = gymnasium.spec('Pendulum-v1')"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(gymnasium.registry, "Own-v0", None)
+    config = RunConfig("own_task:Own-v0", AGENT, SCHEDULE, EnvOptions(allow_import=True))
+    work, asked = Training(config, (0,), tmp_path / "runs"), itertools.count()
+    work(lambda: next(asked) > 6)
+    assert not work.finished() and any(work.runs()[0].glob("checkpoints/0*"))
+    work(lambda: False)
+    assert work.finished()
 
 
 def test_a_run_that_another_process_begins_is_left_alone(launched: list[str], tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ def settings(name: Any, panel: int, field: str) -> list[Any]:
 @pytest.mark.parametrize("scale", SCALE_NAMES)
 def test_studies_of_a_scale_can_share_their_folder(scale: Any) -> None:
     runs: dict[Any, Any] = {}
-    models: dict[str, Any] = {}
+    models: dict[Any, Any] = {}
     for name in NAMES:
         for panel in study(name, scale).panels:
             assert bool(panel.cells) != bool(panel.models)
@@ -29,7 +29,7 @@ def test_studies_of_a_scale_can_share_their_folder(scale: Any) -> None:
             for cell in panel.cells:
                 assert runs.setdefault(cell.folder, cell) == cell
             for model in panel.models:
-                assert models.setdefault(model.label, model) == model
+                assert models.setdefault((model.env, model.label), model) == model
     assert len({str(folder).lower() for folder in runs}) == len(runs)
 
 
@@ -73,6 +73,7 @@ def test_table_1_has_the_papers_hours_beside_the_measured_ones() -> None:
 def test_an_ablation_changes_one_thing() -> None:
     dynamics, demonstrations, values, model = study("figure-9", "paper").panels
     whole, plain = (model.agent for model in dynamics.models)
+    assert {model.env for model in dynamics.models} == {cell.config.env for cell in demonstrations.cells}
     assert whole == mbdpg.Config(**FAR) and (plain.gaussians, plain.memory) == (1, 0)
     whole, other = demonstrations.cells
     assert whole.config == other.config and (whole.demonstrated, other.demonstrated) == (False, True)

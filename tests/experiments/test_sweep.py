@@ -17,6 +17,7 @@ from mbdpg.experiments.launch import Work, launch
 from mbdpg.experiments.pool import Local
 from mbdpg.experiments.search import Search
 from mbdpg.experiments.sweep import Trial, sweep
+from mbdpg.experiments.work import Training
 from mbdpg.interfaces import UserError
 from mbdpg.storage.metrics import read_metrics
 from mbdpg.training.loop import Schedule
@@ -134,6 +135,27 @@ def test_a_sweep_goes_on_where_it_was_and_says_what_was_best(here: None, tmp_pat
     assert table(tmp_path)[:3] == rows and len(table(tmp_path)) == 4
     with pytest.raises(UserError, match="is of another sweep"):
         begin(tmp_path, searches=SEARCHES[:1])
+
+
+def test_what_was_best_is_said_in_flags_that_train_takes() -> None:
+    flags = [module._as_flag(*setting) for setting in (("plain", False), ("plain", True), ("batch_size", 3))]
+    assert flags == ["--no-plain", "--plain", "--batch-size 3"]
+
+
+def test_a_score_leaves_out_the_evaluation_before_anything_was_done(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "returns", lambda training: {0: -1000.0, 20: 1.0, 40: 3.0})
+    assert module.score(Training(CONFIG, (0,), Path("trial"))) == 2.0
+
+
+@extras
+def test_fewer_trials_than_before_of_which_none_was_completed_are_said_to_be_none(
+    here: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`max` of nothing was an unexpected error."""
+    monkeypatch.setattr(Search, "suggest", lambda self, trial, agent: -1 if trial.number == 0 else 3)
+    begin(tmp_path, trials=2, searches=SEARCHES[:1])
+    with pytest.raises(UserError, match="no trial was completed"):
+        begin(tmp_path, trials=1, searches=SEARCHES[:1])
 
 
 @extras

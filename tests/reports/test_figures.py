@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import warnings
 from pathlib import Path
 
 import pytest
@@ -39,8 +40,8 @@ def errors(path: Path, scale: float) -> Path:
     return path
 
 
-def test_hours_go_on_over_resumes_and_failed_evaluations(tmp_path: Path) -> None:
-    run = make(tmp_path / "run", {0: 1.0, 10: None, 20: 3.0, 30: 4.0}, seconds=(360.0, 720.0, 180.0, 360.0), expert=7)
+def test_hours_go_on_over_failed_evaluations(tmp_path: Path) -> None:
+    run = make(tmp_path / "run", {0: 1.0, 10: None, 20: 3.0, 30: 4.0}, seconds=(360.0, 720.0, 900.0, 1080.0), expert=7)
     found = evaluations(run)
     assert list(found) == [0, 20, 30] and {one.expert_env_steps for one in found.values()} == {7}
     assert [one.hours for one in found.values()] == pytest.approx([0.1, 0.25, 0.3])
@@ -101,6 +102,15 @@ def test_runs_without_a_common_step_are_left_out_of_the_picture(tmp_path: Path) 
     runs = {"a": [make(tmp_path / "a", {0: 1.0}), make(tmp_path / "b", {5: 1.0})], "none": []}
     lines = write_figure("figure-x", [Curves("E-v0", runs)], tmp_path)
     assert lines[3:6] == ["## E-v0", "", "Nothing to compare yet."]
+
+
+def test_models_that_all_failed_leave_an_empty_picture_without_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert "Nothing to compare yet." in write_figure("figure-x", [Errors("models", {})], tmp_path)
+    assert caplog.records == []
 
 
 def test_tables_lie_in_a_file_that_says_what_made_them(tmp_path: Path) -> None:
