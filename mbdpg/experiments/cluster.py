@@ -30,6 +30,16 @@ class Ray:
     gpus: bool = False
     """Whether every piece of work gets a GPU, else a core."""
 
+    @property
+    def seeds_together(self) -> bool:
+        """Seeds that share a GPU are one program."""
+        return self.gpus
+
+    @property
+    def flags(self) -> Sequence[str]:
+        """Without the address."""
+        return ("--engine ray", *(["--gpus"] * self.gpus))
+
     def run(
         self, works: Sequence[Work], logs: Path, say: Callable[[str], None], should_stop: Callable[[], bool]
     ) -> dict[str, str]:

@@ -33,6 +33,14 @@ class Work(Protocol):
 class Engine(Protocol):
     """A place where pieces of work are done."""
 
+    @property
+    def seeds_together(self) -> bool:
+        """Whether the seeds of a configuration are better one piece of work than one each."""
+
+    @property
+    def flags(self) -> Sequence[str]:
+        """What chooses it on the command line, wherever it lies."""
+
     def run(
         self, works: Sequence[Work], logs: Path, say: Callable[[str], None], should_stop: Callable[[], bool]
     ) -> dict[str, str]:

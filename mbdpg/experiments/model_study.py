@@ -20,7 +20,7 @@ from mbdpg.dynamics.aggregation import Aggregate, Aggregation
 from mbdpg.dynamics.fitting import open_loop_error
 from mbdpg.experiments.compilations import keep_compilations
 from mbdpg.experiments.config import RunConfig
-from mbdpg.experiments.work import made_as, say_made_as, steps_evaluated
+from mbdpg.experiments.work import is_made_as, refuse_made_otherwise, say_made_as, steps_evaluated
 from mbdpg.interfaces import Batch, Sampling, require
 from mbdpg.storage.checkpoint import load_checkpoint
 from mbdpg.storage.files import replace_table
@@ -67,15 +67,16 @@ class ModelFit:
         return f"{self.label} seed {self.seed}"
 
     def finished(self) -> bool:
-        """Whether its errors are known.
-
-        Raises:
-            UserError: those that are there are of other settings.
-        """
-        return made_as(self.out, self._settings()) and is_whole(self.out)
+        """Whether its errors are known, of these settings."""
+        return is_whole(self.out) and is_made_as(self.out, self._settings())
 
     def __call__(self, should_stop: Callable[[], bool]) -> None:
-        """Do it; stopped, it leaves nothing behind: it takes minutes."""
+        """Do it; stopped, it leaves nothing behind: it takes minutes.
+
+        Raises:
+            UserError: there are errors of other settings, or too few steps to learn from.
+        """
+        refuse_made_otherwise(self.out, self._settings())
         keep_compilations()
         there = steps_evaluated(self.data)
         require(there >= self.data_steps, f"{self.data} has {there:,} of {self.data_steps:,} steps to learn from yet")

@@ -43,6 +43,16 @@ class Local:
     def __post_init__(self) -> None:
         require(self.workers >= 1, f"--workers is {self.workers}, expected at least 1")
 
+    @property
+    def seeds_together(self) -> bool:
+        """No: on cores each has a program of its own."""
+        return False
+
+    @property
+    def flags(self) -> Sequence[str]:
+        """None: it is the default."""
+        return ()
+
     def run(
         self, works: Sequence[Work], logs: Path, say: Callable[[str], None], should_stop: Callable[[], bool]
     ) -> dict[str, str]:

@@ -5,13 +5,12 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 from mbdpg.experiments import expert
-from mbdpg.experiments.cluster import Ray
 from mbdpg.experiments.config import RunConfig
 from mbdpg.experiments.launch import Engine, Work, launch
-from mbdpg.experiments.model_study import ModelFit, is_whole
+from mbdpg.experiments.model_study import ModelFit
 from mbdpg.experiments.studies import SCALES, Cell, Model, Scale, ScaleName, Study, StudyName, study
 from mbdpg.experiments.work import Demonstrating, Training, origin_of
 from mbdpg.interfaces import require
@@ -49,52 +48,51 @@ def reproduce(
     scale = SCALES[scale_name]
     scale = dataclasses.replace(scale, seeds=tuple(seeds)) if seeds else scale
     chosen = study(name, scale_name)
-    # Seeds that share a GPU are one program; on cores each has one of its own.
-    together = isinstance(engine, Ray) and engine.gpus
-    groups = [scale.seeds] if together else [(seed,) for seed in scale.seeds]
-    first, then = _works(chosen, scale, groups, out)
     heading = [f"`{_command(name, scale_name, seeds, engine)}`", f"The paper says: {chosen.claim}"]
     say(f"{name}: {heading[-1]}")
+    groups = [scale.seeds] if engine.seeds_together else [(seed,) for seed in scale.seeds]
+    pieces = _pieces(chosen, scale, groups, out)
+    first = {piece.needs.name: piece.needs for piece in pieces if piece.needs}
     failures: dict[str, str] = {}
+
+    def do(works: Sequence[Work]) -> None:
+        due = sum(not work.finished() for work in works)
+        say(f"{name}: {due} of {len(works)} to do" if works else f"{name}: nothing to prepare")
+        failures.update(launch(works, engine, logs=out / "logs", say=say, should_stop=should_stop))
+
     with only_writer(out):
-        for works in (first, then):
-            due = sum(not work.finished() for work in works)
-            say(f"{name}: {due} of {len(works)} to do" if works else f"{name}: nothing to prepare")
-            failures |= launch(works, engine, logs=out / "logs", say=say, should_stop=should_stop)
-            if should_stop():
-                return
+        do([*first.values()])
+        lacking = [p for p in pieces if p.needs and p.needs.name in failures and not p.work.finished()]
+        if not should_stop():
+            do([*{piece.work.name: piece.work for piece in pieces if piece not in lacking}.values()])
+        if should_stop():
+            return
+        failures |= {piece.work.name: f"it needs {piece.needs.name}" for piece in lacking if piece.needs}
         if failures:
             heading.append(f"Not here, for they failed: {'; '.join(sorted(failures))}.")
         _draw(chosen, scale, out, heading, say)
-    logs, count = out / "logs", len(first) + len(then)
-    require(not failures, f"{len(failures)} of {count} failed (see {logs}); the figure lacks them")
+    count = len(first.keys() | {piece.work.name for piece in pieces})
+    require(not failures, f"{len(failures)} of {count} failed (see {out / 'logs'}); the figure lacks them")
 
 
-def _works(chosen: Study, scale: Scale, groups: Sequence[tuple[int, ...]], out: Path) -> tuple[list[Work], list[Work]]:
-    """What has to be done first, and what builds on it; pieces that several panels share, once."""
-    first: dict[str, Work] = {}
-    then: dict[str, Work] = {}
+class _Piece(NamedTuple):
+    """A piece of work, and what has to be done before."""
 
-    def add(works: dict[str, Work], work: Any) -> None:
-        works[work.name] = work
+    work: Work
+    needs: Work | None = None
 
+
+def _pieces(chosen: Study, scale: Scale, groups: Sequence[tuple[int, ...]], out: Path) -> list[_Piece]:
+    """All that a study is made of; what several panels share is there several times."""
+    found: list[_Piece] = []
     for panel in chosen.panels:
         for cell in panel.cells:
-            if cell.demonstrated:
-                add(first, _demonstrating(cell, scale, out))
-            for seeds in groups:
-                add(then, _training(cell, seeds, scale, out))
+            shown = _demonstrating(cell, scale, out) if cell.demonstrated else None
+            found += [_Piece(_training(cell, seeds, scale, out), shown) for seeds in groups]
         for model in panel.models:
-            teacher = _teacher(RunConfig(model.env), scale.recorded_steps, scale)
-            recorded = Training(teacher, (0,), out / model.env / "recorded")
-            add(first, recorded)
-            for seed in scale.seeds:
-                file = _errors_file(model, seed, out)
-                data = recorded.out / "seed-0"
-                given = (model.agent, scale.model_updates, data, scale.recorded_steps, seed, file)
-                fitting = (*given, model.aggregation, model.members)
-                add(then, ModelFit(f"{model.env} {model.label}", *fitting))
-    return list(first.values()), list(then.values())
+            recorded = _recording(model, scale, out)
+            found += [_Piece(_fitting(model, seed, scale, out), recorded) for seed in scale.seeds]
+    return found
 
 
 def _training(cell: Cell, seeds: tuple[int, ...], scale: Scale, out: Path) -> Training:
@@ -108,6 +106,26 @@ def _demonstrating(cell: Cell, scale: Scale, out: Path) -> Demonstrating:
     return Demonstrating(teacher, scale.success_share * success, out / cell.config.env)
 
 
+def _recording(model: Model, scale: Scale, out: Path) -> Training:
+    """The run whose steps a model learns from."""
+    return Training(_teacher(RunConfig(model.env), scale.recorded_steps, scale), (0,), out / model.env / "recorded")
+
+
+def _fitting(model: Model, seed: int, scale: Scale, out: Path) -> ModelFit:
+    (data,) = _recording(model, scale, out).runs()
+    return ModelFit(
+        label=f"{model.env} {model.label}",
+        agent=model.agent,
+        updates=scale.model_updates,
+        data=data,
+        data_steps=scale.recorded_steps,
+        seed=seed,
+        out=out / model.env / "models" / model.label.replace(" ", "-") / f"seed-{seed}.csv",
+        aggregation=model.aggregation,
+        members=model.members,
+    )
+
+
 def _teacher(like: RunConfig, steps: int, scale: Scale) -> RunConfig:
     """TD3 on the same task."""
     config = expert.config_of(like.env, steps, like.env_options)
@@ -115,16 +133,10 @@ def _teacher(like: RunConfig, steps: int, scale: Scale) -> RunConfig:
     return dataclasses.replace(config, agent=dataclasses.replace(config.agent, **tiny))
 
 
-def _errors_file(model: Model, seed: int, out: Path) -> Path:
-    return out / model.env / "models" / model.label.replace(" ", "-") / f"seed-{seed}.csv"
-
-
 def _command(name: StudyName, scale_name: ScaleName, seeds: Sequence[int], engine: Engine) -> str:
     """What makes the same from nothing, wherever it lies."""
-    words = ["mbdpg reproduce", name, "--scale", scale_name, *(["--seeds", *map(str, seeds)] if seeds else [])]
-    if isinstance(engine, Ray):
-        words += ["--engine ray", *(["--gpus"] * engine.gpus)]
-    return " ".join(words)
+    chosen = ["--seeds", *map(str, seeds)] if seeds else []
+    return " ".join(["mbdpg reproduce", name, "--scale", scale_name, *chosen, *engine.flags])
 
 
 def _draw(chosen: Study, scale: Scale, out: Path, heading: Sequence[str], say: Callable[[str], None]) -> None:
@@ -134,8 +146,8 @@ def _draw(chosen: Study, scale: Scale, out: Path, heading: Sequence[str], say: C
         if panel.models:
             files = {}
             for model in panel.models:
-                whole = [file for seed in scale.seeds if is_whole(file := _errors_file(model, seed, out))]
-                files[model.label] = {file: origin_of(file) for file in whole}
+                fits = [_fitting(model, seed, scale, out) for seed in scale.seeds]
+                files[model.label] = {fit.out: origin_of(fit.out) for fit in fits if fit.finished()}
             panels.append(Errors(panel.title, {label: found for label, found in files.items() if found}))
         else:
             done = {cell.label: _training(cell, scale.seeds, scale, out).done() for cell in panel.cells}

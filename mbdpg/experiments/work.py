@@ -104,15 +104,16 @@ class Demonstrating:
         return self.out / "demonstrations.safetensors"
 
     def finished(self) -> bool:
-        """Whether they are recorded.
-
-        Raises:
-            UserError: those that are there were made otherwise.
-        """
-        return made_as(self.file, self._settings())
+        """Whether they are recorded, by this expert."""
+        return is_made_as(self.file, self._settings())
 
     def __call__(self, should_stop: Callable[[], bool]) -> None:
-        """Train, then record."""
+        """Train, then record.
+
+        Raises:
+            UserError: there are demonstrations made otherwise, or the expert has no success.
+        """
+        refuse_made_otherwise(self.file, self._settings())
         training, config = Training(self.expert, (0,), self.out / "expert"), self.expert
         training(should_stop)
         if should_stop():
@@ -126,22 +127,24 @@ class Demonstrating:
         return {"expert": self.expert.to_json(), "success_return": self.success_return}
 
 
-def made_as(file: Path, settings: Mapping[str, Any]) -> bool:
-    """Whether a file is there and was made with these settings, as the note beside it says.
+def is_made_as(file: Path, settings: Mapping[str, Any]) -> bool:
+    """Whether a file is there and was made with these settings, as the note beside it says."""
+    noted = {name: value for name, value in _noted(file).items() if name != ORIGIN}
+    return file.exists() and _as_text(noted) == _as_text(settings)
+
+
+def refuse_made_otherwise(file: Path, settings: Mapping[str, Any]) -> None:
+    """Leave what was made with other settings, or nobody knows how, as it is.
 
     Raises:
-        UserError: it was made with others, or nobody knows.
+        UserError: a file is there and was.
     """
-    if not file.exists():
-        return False
-    noted = {name: value for name, value in _noted(file).items() if name != ORIGIN}
-    same = _as_text(noted) == _as_text(settings)
-    require(same, f"{file} was made with other settings; move it away, or choose another --out")
-    return True
+    fits = not file.exists() or is_made_as(file, settings)
+    require(fits, f"{file} was made with other settings; move it away, or choose another --out")
 
 
 def say_made_as(file: Path, settings: Mapping[str, Any]) -> None:
-    """Write the note that `made_as` and `origin_of` read, before the file itself."""
+    """Write the note that `is_made_as` and `origin_of` read, before the file itself."""
     file.parent.mkdir(parents=True, exist_ok=True)
     replace_durably(_note(file), _as_text({**settings, ORIGIN: origin()}).encode())
 

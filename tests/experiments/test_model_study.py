@@ -96,5 +96,8 @@ def test_a_fit_leaves_the_errors_of_its_model(
     longer(lambda: False)
     learned = np.loadtxt(longer.out, delimiter=",", skiprows=1)
     assert (learned[:, 2] == table[:, 2]).all() and learned[0, 1] < min(0.9 * learned[0, 2], table[0, 1])
+    other = dataclasses.replace(fit, updates=4)
+    assert not other.finished()
     with pytest.raises(UserError, match=r"seed-0.csv was made with other settings"):
-        dataclasses.replace(fit, updates=4).finished()
+        other(lambda: False)
+    assert fit.finished()

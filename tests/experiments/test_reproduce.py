@@ -21,7 +21,7 @@ from mbdpg.experiments.pool import Local
 from mbdpg.experiments.reproduce import reproduce
 from mbdpg.experiments.run import train
 from mbdpg.experiments.studies import SCALES, Cell, Panel, Study
-from mbdpg.experiments.work import Training, made_as, origin_of, say_made_as
+from mbdpg.experiments.work import Training, is_made_as, origin_of, refuse_made_otherwise, say_made_as
 from mbdpg.interfaces import UserError
 from mbdpg.storage.run_folder import RunFolder, only_writer
 from mbdpg.training.loop import Schedule
@@ -229,18 +229,36 @@ def test_a_second_reproduce_in_the_same_folder_is_refused(launched: list[str], t
 def test_demonstrations_and_errors_of_another_scale_are_refused(tmp_path: Path) -> None:
     file = tmp_path / "seed-0.csv"
     say_made_as(file, {"updates": 20})
-    assert not made_as(file, {"updates": 20})
+    assert not is_made_as(file, {"updates": 20})
     file.write_text("depth")
-    assert made_as(file, {"updates": 20})
+    assert is_made_as(file, {"updates": 20})
     assert origin_of(file).keys() == {"commit", "machine"}
     with pytest.raises(UserError, match="seed-0.csv was made with other settings; move it away"):
-        made_as(file, {"updates": 3000})
+        refuse_made_otherwise(file, {"updates": 3000})
     note = tmp_path / "seed-0.csv.settings.json"
     note.write_text('{"updates": 20}')  # of before origins were noted
-    assert made_as(file, {"updates": 20}) and origin_of(file) == {}
+    assert is_made_as(file, {"updates": 20}) and origin_of(file) == {}
     note.write_text('{"updates": 20, "origin": {"commit": "another"}}')
-    assert made_as(file, {"updates": 20}) and origin_of(file) == {"commit": "another"}
+    assert is_made_as(file, {"updates": 20}) and origin_of(file) == {"commit": "another"}
     for damaged in ("{", "[]", ""):
         note.write_text(damaged)
         with pytest.raises(UserError, match="seed-0.csv was made with other settings"):
-            made_as(file, {"updates": 20})
+            refuse_made_otherwise(file, {"updates": 20})
+
+
+def test_demonstrations_of_another_expert_fail_what_needs_them_and_nothing_else(
+    launched: list[str], tmp_path: Path, monkeypatch: Any
+) -> None:
+    """They stopped the whole study, and nothing was drawn."""
+    taught = dataclasses.replace(cell("td3 taught"), demonstrated=True)
+    study = dataclasses.replace(STUDY, panels=(Panel("demonstrations", (cell("td3"), taught)),))
+    monkeypatch.setattr(module, "study", lambda name, scale: study)
+    others = tmp_path / "Pendulum-v1" / "demonstrations.safetensors"
+    say_made_as(others, {"expert": "another"})
+    others.write_bytes(b"recorded for days")
+    with pytest.raises(UserError, match="2 of 3 failed"):
+        begin(tmp_path, seeds=[0])
+    assert launched == ["Pendulum-v1 expert", "Pendulum-v1 td3 seed 0"]
+    assert others.read_bytes() == b"recorded for days" and {row["label"] for row in numbers(tmp_path)} == {"td3"}
+    failed = "they failed: Pendulum-v1 expert; Pendulum-v1 td3-taught seed 0."
+    assert failed in (tmp_path / "figure-8.md").read_text()
