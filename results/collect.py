@@ -14,16 +14,13 @@ import sys
 from collections import defaultdict
 from pathlib import Path
 
-import matplotlib
+from matplotlib.figure import Figure
 
 from mbdpg.reports.record import mean_curve
 from mbdpg.reports.statistics import summarize
 from mbdpg.storage.files import replace_table
 from mbdpg.storage.metrics import read_metrics
 from mbdpg.storage.run_folder import RunFolder
-
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
 
 HERE = Path(__file__).parent
 BUDGETS = (50_000, 100_000)
@@ -119,7 +116,8 @@ def tell(curves: dict[str, Curves]) -> None:
 
 def draw(name: str, env: str, curves: dict[str, Curves]) -> None:
     """Write NAME.png: our curves, and what others have published of theirs."""
-    figure, axes = plt.subplots(figsize=(8, 4.6), layout="constrained")
+    figure = Figure(figsize=(8, 4.6), layout="constrained")
+    axes = figure.subplots()
     for number, (algorithm, seeds) in enumerate(curves.items()):
         for curve in seeds.values():
             axes.plot(list(curve), list(curve.values()), color=f"C{number}", alpha=0.35, linewidth=1)
