@@ -1,5 +1,8 @@
 """MBDPG's update of actor and critics written in eager torch, as a peer of ours for speed.
 
+It computes the same and is written as one would write it: its actor and its critics each go through the critics and
+back, where ours share one way (`Critics.with_slopes`).
+
 Runs in the environment that `make peers` builds, which has no mbdpg; benchmarks/side_by_side.py calls it and checks
 that it computes the same. Parameters have the names of our checkpoints. Settings are those of `mbdpg benchmark`: the
 full gradient, deterministic imagination, lambda-returns, no target noise.

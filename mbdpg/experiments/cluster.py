@@ -83,7 +83,7 @@ def _as_task(work: Work, log: Path, stop_file: Path) -> str | None:
             work(stop_file.exists)
         except Exception as error:
             traceback.print_exc()
-            return str(error)
+            return one_line(str(error)) or type(error).__name__
     return None
 
 

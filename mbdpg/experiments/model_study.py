@@ -20,7 +20,7 @@ from mbdpg.dynamics.aggregation import Aggregate, Aggregation
 from mbdpg.dynamics.fitting import open_loop_error
 from mbdpg.experiments.compilations import keep_compilations
 from mbdpg.experiments.config import RunConfig
-from mbdpg.experiments.work import is_made_as, refuse_made_otherwise, say_made_as, steps_evaluated
+from mbdpg.experiments.work import is_made_as, refuse_made_otherwise, say_made_as
 from mbdpg.interfaces import Batch, Sampling, require
 from mbdpg.storage.checkpoint import load_checkpoint
 from mbdpg.storage.files import replace_table
@@ -78,8 +78,6 @@ class ModelFit:
         """
         refuse_made_otherwise(self.out, self._settings())
         keep_compilations()
-        there = steps_evaluated(self.data)
-        require(there >= self.data_steps, f"{self.data} has {there:,} of {self.data_steps:,} steps to learn from yet")
         config, steps = RunConfig.from_json(RunFolder.open(self.data).config), Recorded.load(self.data, self.data_steps)
         env = config.make_env()
         agent, rng = MBDPG(self.agent, env.spec), np.random.default_rng(self.seed)
@@ -137,9 +135,11 @@ class Recorded:
         """Read the first so many from the run's newest checkpoint: it may have been trained for longer.
 
         Raises:
-            UserError: there are too few long episodes.
+            UserError: there are too few steps, or too few long episodes.
         """
         replay = Replay.from_columns({name: column[:steps] for name, column in load_checkpoint(run).replay.items()})
+        saved = f"{run} has saved {replay.size:,} of {steps:,} steps to learn from"
+        require(replay.size == steps, f"{saved}; go on with it: mbdpg resume {run}")
         start = replay.columns()["start"]
         starts, episode = np.unique(start, return_inverse=True)
         held_out = episode % HELD_OUT == HELD_OUT - 1

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mbdpg.experiments import expert
-from mbdpg.experiments.config import RunConfig
+from mbdpg.experiments.config import EnvOptions, RunConfig
 from mbdpg.experiments.launch import Engine, Work, launch
 from mbdpg.experiments.model_study import ModelFit
+from mbdpg.experiments.presets import PAPER_EPISODE_LIMIT
 from mbdpg.experiments.studies import SCALES, Cell, Model, Scale, ScaleName, Study, StudyName, study
 from mbdpg.experiments.work import Demonstrating, Training, origin_of
 from mbdpg.interfaces import require
@@ -56,23 +57,26 @@ def reproduce(
     failures: dict[str, str] = {}
 
     def do(works: Sequence[Work]) -> None:
-        due = sum(not work.finished() for work in works)
-        say(f"{name}: {due} of {len(works)} to do" if works else f"{name}: nothing to prepare")
+        say(f"{name}: {sum(not work.finished() for work in works)} of {len(works)} to do")
         failures.update(launch(works, engine, logs=out / "logs", say=say, should_stop=should_stop))
 
     with only_writer(out):
-        do([*first.values()])
+        if first:
+            do([*first.values()])
         lacking = [p for p in pieces if p.needs and p.needs.name in failures and not p.work.finished()]
         if not should_stop():
             do([*{piece.work.name: piece.work for piece in pieces if piece not in lacking}.values()])
         if should_stop():
             return
-        failures |= {piece.work.name: f"it needs {piece.needs.name}" for piece in lacking if piece.needs}
+        for piece in lacking:
+            failures[piece.work.name] = f"left out, it needs {piece.needs.name if piece.needs else ''}"
+            say(f"{piece.work.name}: {failures[piece.work.name]}")
         if failures:
-            heading.append(f"Not here, for they failed: {'; '.join(sorted(failures))}.")
+            heading.append(f"Not finished, for it failed or was left out: {'; '.join(sorted(failures))}.")
         _draw(chosen, scale, out, heading, say)
     count = len(first.keys() | {piece.work.name for piece in pieces})
-    require(not failures, f"{len(failures)} of {count} failed (see {out / 'logs'}); the figure lacks them")
+    wrong = f"{len(failures)} of {count} failed or were left out"
+    require(not failures, f"{wrong} (see {out / 'logs'}); the figure lacks them")
 
 
 class _Piece(NamedTuple):
@@ -108,7 +112,8 @@ def _demonstrating(cell: Cell, scale: Scale, out: Path) -> Demonstrating:
 
 def _recording(model: Model, scale: Scale, out: Path) -> Training:
     """The run whose steps a model learns from."""
-    return Training(_teacher(RunConfig(model.env), scale.recorded_steps, scale), (0,), out / model.env / "recorded")
+    task = RunConfig(model.env, env_options=EnvOptions(max_episode_steps=PAPER_EPISODE_LIMIT))
+    return Training(_teacher(task, scale.recorded_steps, scale), (0,), out / model.env / "recorded")
 
 
 def _fitting(model: Model, seed: int, scale: Scale, out: Path) -> ModelFit:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -104,8 +105,9 @@ class Trial:
 
         training(lambda: bad or should_stop(), watch)
         if training.finished():
-            study.tell(trial, score(training))
-            self._write(trial.number, values, "complete")
+            reached = score(training)
+            study.tell(trial, reached)  # which takes NaN for a failure
+            self._write(trial.number, values, "failed" if math.isnan(reached) else "complete")
         elif bad:
             study.tell(trial, state=_optuna().trial.TrialState.PRUNED)
             self._write(trial.number, values, "pruned")
@@ -176,8 +178,9 @@ def returns(training: Training) -> Curve:
 
 
 def score(training: Training) -> float:
-    """Mean over seeds and the last evaluations with anything done before: what is maximized."""
-    return float(np.mean([value for step, value in returns(training).items() if step > 0][-LAST:]))
+    """Mean over seeds and the last evaluations with anything done before: what is maximized; NaN if all failed."""
+    last = [value for step, value in returns(training).items() if step > 0][-LAST:]
+    return float(np.mean(last)) if last else math.nan
 
 
 def opened(out: Path, seed: int = 0, warm_up: int = 0) -> Any:

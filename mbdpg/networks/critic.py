@@ -44,19 +44,21 @@ class Critics(eqx.Module):
     ) -> tuple[Float[Array, "critic *batch"], Slopes]:
         """Values, and all their derivatives (leading axis `critic`; of all of `batch`, `row`).
 
-        By what a critic sees, values have the derivative they always have; by its parameters none: that is `weighed`,
-        of the same slopes. So an actor's loss and the critics' own cost one way through the critics and back.
+        By what a critic sees, values have the derivative they always have; by its parameters none, which is what
+        `weighted_gradient` makes of the slopes. So the actor's loss and the critics' own cost one way through the
+        critics and back.
         """
         pair, rows = _paired(observation, action)
-        slopes: Slopes = jax.lax.stop_gradient(eqx.filter_vmap(MLP.slopes, in_axes=(0, None))(self.mlps, rows))
-        nothing = (rows - jax.lax.stop_gradient(rows))[None]
-        values = slopes.output + jnp.sum(slopes.by_input * nothing, axis=-1)
+        mlps, here = jax.lax.stop_gradient((self.mlps, rows))
+        slopes: Slopes = eqx.filter_vmap(MLP.slopes, in_axes=(0, None))(mlps, here)
+        zero = (rows - here)[None]  # with a derivative
+        values = slopes.output + jnp.sum(slopes.by_input * zero, axis=-1)
         return values.reshape(-1, *pair.shape[:-1]), slopes
 
-    def weighed(self, slopes: Slopes, weights: Float[Array, "critic *batch"]) -> Critics:
+    def weighted_gradient(self, slopes: Slopes, weights: Float[Array, "critic *batch"]) -> Critics:
         """The derivative of the values' weighted sum by every parameter."""
         rows = weights.reshape(weights.shape[0], -1)
-        return eqx.tree_at(lambda x: x.mlps, self, eqx.filter_vmap(MLP.weighed)(self.mlps, slopes, rows))
+        return eqx.tree_at(lambda x: x.mlps, self, eqx.filter_vmap(MLP.weighted_gradient)(self.mlps, slopes, rows))
 
 
 def _paired(observation: Array, action: Array) -> tuple[Array, Array]:

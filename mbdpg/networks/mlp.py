@@ -141,7 +141,7 @@ class MLP(eqx.Module):
             slope = matrix_product(by_product, linear.weight.T)
         return Slopes(self.output(features)[:, 0], slope, tuple(hidden[::-1]), features)
 
-    def weighed(self, slopes: Slopes, weights: Float[Array, " row"]) -> MLP:
+    def weighted_gradient(self, slopes: Slopes, weights: Float[Array, " row"]) -> MLP:
         """The derivative of the outputs' weighted sum by every parameter."""
         hidden, norms = [], []
         for before, normalized, by_product, by_affine in slopes.hidden:

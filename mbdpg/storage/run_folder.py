@@ -138,13 +138,18 @@ def discard_unbegun(path: Path) -> None:
     Raises:
         UserError: it is no run folder, a process works in it, or it holds something that mbdpg did not write.
     """
-    if not {entry.name for entry in path.iterdir()} <= {f"{TEMPORARY}{_CONFIG}", "lock"}:
+    if not path.is_dir() or not {entry.name for entry in path.iterdir()} <= {f"{TEMPORARY}{_CONFIG}", "lock"}:
         RunFolder.open(path)
     with only_writer(path):
         strange = [entry.name for entry in path.iterdir() if entry.name.removeprefix(TEMPORARY) not in _CONTENTS]
         strange += [entry.name for entry in (path / "checkpoints").glob("[0-9]*")]
         if strange:
             raise UserError(f"{path} has no checkpoint, but has {strange[0]!r}; move it away, or choose another --out")
+        for part in _CONTENTS[::-1]:  # the config last: without it what is left would be nobody's
+            if (path / part).is_dir():
+                shutil.rmtree(path / part)
+            else:
+                (path / part).unlink(missing_ok=True)
         shutil.rmtree(path)
 
 

@@ -95,6 +95,7 @@ class Training:
         self._sums: list[dict[str, list[float]]] = [{} for _ in collectors]
         self._seconds = {"acting": 0.0, "evaluating": 0.0} | {phase.name: 0.0 for phase in learner.agent.phases}
         self._began = time.monotonic()
+        self._before = [dict.fromkeys(("seconds", *self._seconds), 0.0) for _ in collectors]
 
     def run(self, on_update: Callable[[Update], None], should_stop: Callable[[], bool]) -> None:
         """Learn, record and collect until the last step, or until asked to stop; then save.
@@ -127,7 +128,7 @@ class Training:
                 "recorded": self._recorded,
                 "expert_env_steps": self._expert_env_steps,
                 "demonstrated": collector.replay.demonstrated,
-                "clock": self._clock(),
+                "clock": self._clock(index),
             }
             recorder.save_checkpoint(self.env_steps, self.learner.snapshot(index), facts, collector.replay.columns())
 
@@ -140,9 +141,7 @@ class Training:
         self._recorded = facts[0]["recorded"]
         self._expert_env_steps = facts[0]["expert_env_steps"]
         self._sums = [dict(fact["sums"]) for fact in facts]
-        clock = facts[0]["clock"]
-        self._began -= float(clock["time/seconds"])
-        self._seconds = {name: float(clock[f"time/{name}"]) for name in self._seconds}
+        self._before = [{name: float(fact["clock"][f"time/{name}"]) for name in self._before[0]} for fact in facts]
         for collector, fact in zip(self.collectors, facts, strict=True):
             collector.restore(fact["collector"])
 
@@ -227,7 +226,7 @@ class Training:
                 "expert_env_steps": self._expert_env_steps,
             }
             row |= {name: float(values[index]) for name, values in metrics.items()}
-            recorder.write("eval", self.env_steps, row | self._clock())
+            recorder.write("eval", self.env_steps, row | self._clock(index))
             recorder.save_policy(policies[index].arrays, self.env_steps, row["eval/return_mean"])
         return evaluations
 
@@ -255,10 +254,10 @@ class Training:
                     "train/episode_return": collector.returns[-1],
                     "train/return_mean": np.mean(collector.returns[-10:]),
                 }
-            recorder.write("train", self.env_steps, row | self._clock())
+            recorder.write("train", self.env_steps, row | self._clock(index))
             self._sums[index] = {}
 
-    def _clock(self) -> Metrics:
-        """Seconds of all processes that worked on the run, up to the checkpoints it went on from, and their parts."""
-        parts = {f"time/{name}": seconds for name, seconds in self._seconds.items()}
-        return {"time/seconds": time.monotonic() - self._began} | parts
+    def _clock(self, index: int) -> Metrics:
+        """Seconds of all processes that worked on a seed, up to the checkpoints it went on from, and their parts."""
+        now = {"seconds": time.monotonic() - self._began} | self._seconds
+        return {f"time/{name}": before + now[name] for name, before in self._before[index].items()}

@@ -16,6 +16,7 @@ from mbdpg.agents.mbdpg import MBDPG, Config, State
 from mbdpg.dynamics.fitting import Window, warm_memory
 from mbdpg.dynamics.imagination import Ring, imagine
 from mbdpg.interfaces import Batch, EnvSpec, Statistics
+from mbdpg.networks.critic import Critics
 from mbdpg.training.replay import Replay
 
 O, A, BATCH, BURN_IN, LENGTH = 3, 2, 4, 2, 3
@@ -275,6 +276,30 @@ def test_without_a_horizon_the_critics_target_is_td3s() -> None:
     expected = np.asarray(state().real_reward(window))[:, -1] + 0.99 * alive * value
     np.testing.assert_allclose(found, expected, rtol=1e-5)
     assert along.shape == (0, BATCH)
+
+
+@pytest.mark.parametrize("settings", [(), (("horizon", 0),), tuple(PAPER.items())], ids=["default", "0", "paper"])
+def test_the_critics_gradient_is_that_of_differentiating_their_loss(settings: tuple) -> None:
+    """Though it is made of what the actor's loss has found on its way."""
+    one, data = agent(settings), jax.tree.map(jnp.asarray, edited(BATCHES["improve"], terminated=((0, -1), 1)))
+    window, (start_key, target_key, model_key) = state().window(data), jax.random.split(jax.random.key(0), 3)
+    start = one._start(state(), window, key=start_key)
+    imagined = one._actor_loss(state().actor, state(), last(window), start, model_key)[1][0]
+    targets = one._targets(state(), window, start, imagined, key=target_key)
+    weights = imagined.survival()[:-1] * start.weight[None]
+
+    def loss(critics: Critics) -> jax.Array:
+        real = critics(*last(window))
+        total = jnp.sum(jnp.mean(jnp.square(real - targets[0][None]), axis=1))
+        if one.config.horizon == 0:
+            return total
+        along = jnp.square(critics(imagined.observations[:-1], imagined.actions[:-1]) - targets[1][None])
+        return total + one.config.imagined_weight * jnp.sum(along * weights[None]) / jnp.maximum(jnp.sum(weights), 1.0)
+
+    value, gradient = jax.value_and_grad(loss)(state().critics)
+    _, metrics = one.improve(state(), data, key=jax.random.key(0))
+    np.testing.assert_allclose(metrics["critic/loss"], value, rtol=1e-4)
+    np.testing.assert_allclose(metrics["critic/grad_norm"], optax.tree.norm(gradient), rtol=1e-4)
 
 
 def test_without_terminal_values_the_actor_does_not_see_the_critics(differences: Callable[..., set[str]]) -> None:

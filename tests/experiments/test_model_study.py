@@ -75,11 +75,9 @@ def test_a_fit_leaves_the_errors_of_its_model(
     monkeypatch.setattr(model_study.RunFolder, "open", lambda path: config)
     monkeypatch.setattr(model_study.RunConfig, "from_json", lambda data: made())
     out = tmp_path / "models" / "seed-0.csv"
-    fit = ModelFit("m", SMALL, 3, Path("run"), 100, 0, out, kind, count)
-    monkeypatch.setattr(model_study, "steps_evaluated", lambda run: 99)
-    with pytest.raises(UserError, match="run has 99 of 100 steps to learn from yet"):
-        fit(lambda: False)
-    monkeypatch.setattr(model_study, "steps_evaluated", lambda run: 100)
+    fit = ModelFit("m", SMALL, 3, Path("run"), sum(LENGTHS), 0, out, kind, count)
+    with pytest.raises(UserError, match=f"run has saved {sum(LENGTHS)} of 100 steps to learn from; go on with it"):
+        dataclasses.replace(fit, data_steps=100)(lambda: False)
     assert not fit.finished()
     fit(lambda: True)
     assert not fit.finished()

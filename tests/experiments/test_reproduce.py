@@ -14,13 +14,14 @@ import gymnasium
 import pytest
 
 from mbdpg.agents import td3
+from mbdpg.agents.mbdpg import Config as MBDPGConfig
 from mbdpg.experiments import reproduce as module
 from mbdpg.experiments.config import EnvOptions, RunConfig
 from mbdpg.experiments.launch import Work
 from mbdpg.experiments.pool import Local
 from mbdpg.experiments.reproduce import reproduce
 from mbdpg.experiments.run import train
-from mbdpg.experiments.studies import SCALES, Cell, Panel, Study
+from mbdpg.experiments.studies import SCALES, Cell, Model, Panel, Study
 from mbdpg.experiments.work import Training, is_made_as, origin_of, refuse_made_otherwise, say_made_as
 from mbdpg.interfaces import UserError
 from mbdpg.storage.run_folder import RunFolder, only_writer
@@ -101,7 +102,7 @@ def test_a_run_with_other_settings_is_not_taken_for_the_studys(launched: list[st
         seeds=[0],
         out=tmp_path / "Pendulum-v1" / "td3",
     )
-    with pytest.raises(UserError, match=r"1 of 2 failed \(see .*logs\); the figure lacks them"):
+    with pytest.raises(UserError, match=r"1 of 2 failed or were left out \(see .*logs\); the figure lacks them"):
         begin(tmp_path, seeds=[0])
     assert {row["label"] for row in numbers(tmp_path)} == {"td3 width=5"}
     work = Training(STUDY.panels[0].cells[0].config, (0,), tmp_path / "Pendulum-v1" / "td3")
@@ -120,7 +121,10 @@ def test_a_damaged_run_fails_alone_and_is_left_as_it_is(launched: list[str], tmp
     assert damaged.read_text() == "{}\n" * 2
     found = {(row["label"], row["seed"]) for row in numbers(tmp_path)}
     assert found == {("td3", "1"), ("td3 width=5", "0"), ("td3 width=5", "1")}
-    assert "\n\nNot here, for they failed: Pendulum-v1 td3 seed 0.\n\n" in (tmp_path / "figure-8.md").read_text()
+    assert (
+        "\n\nNot finished, for it failed or was left out: Pendulum-v1 td3 seed 0.\n\n"
+        in (tmp_path / "figure-8.md").read_text()
+    )
 
 
 def test_a_run_that_failed_in_the_middle_does_not_cut_the_others_short(
@@ -138,7 +142,7 @@ def test_a_run_that_failed_in_the_middle_does_not_cut_the_others_short(
         begin(tmp_path)
     assert {(row["label"], row["seed"]) for row in numbers(tmp_path)} >= {("td3", "1")}
     text = (tmp_path / "figure-8.md").read_text()
-    assert re.search(r"\| td3 +\| 1 +\| 40 ", text) and "they failed: Pendulum-v1 td3 seed 0." in text
+    assert re.search(r"\| td3 +\| 1 +\| 40 ", text) and "left out: Pendulum-v1 td3 seed 0." in text
 
 
 def test_an_expert_without_success_fails_alone(launched: list[str], tmp_path: Path, monkeypatch: Any) -> None:
@@ -260,5 +264,21 @@ def test_demonstrations_of_another_expert_fail_what_needs_them_and_nothing_else(
         begin(tmp_path, seeds=[0])
     assert launched == ["Pendulum-v1 expert", "Pendulum-v1 td3 seed 0"]
     assert others.read_bytes() == b"recorded for days" and {row["label"] for row in numbers(tmp_path)} == {"td3"}
-    failed = "they failed: Pendulum-v1 expert; Pendulum-v1 td3-taught seed 0."
+    failed = "left out: Pendulum-v1 expert; Pendulum-v1 td3-taught seed 0."
     assert failed in (tmp_path / "figure-8.md").read_text()
+
+
+def test_models_whose_recording_fails_are_named_and_not_tried(
+    launched: list[str], tmp_path: Path, monkeypatch: Any
+) -> None:
+    """It said that there was nothing to prepare."""
+    models = (Model("one", "Pendulum-v1", MBDPGConfig()), Model("two", "Pendulum-v1", MBDPGConfig(gaussians=1)))
+    study = dataclasses.replace(STUDY, panels=(Panel("models", models=models),))
+    monkeypatch.setattr(module, "study", lambda name, scale: study)
+    (tmp_path / "Pendulum-v1" / "recorded" / "seed-0").mkdir(parents=True)
+    (tmp_path / "Pendulum-v1" / "recorded" / "seed-0" / "thesis.txt").write_text("years of work")
+    said: list[str] = []
+    with pytest.raises(UserError, match="3 of 3 failed or were left out"):
+        reproduce("figure-8", "smoke", tmp_path, Local(1), say=said.append)
+    assert launched == ["Pendulum-v1 recorded seed 0"]
+    assert "Pendulum-v1 two seed 0: left out, it needs Pendulum-v1 recorded seed 0" in said

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -145,6 +146,8 @@ def test_what_was_best_is_said_in_flags_that_train_takes() -> None:
 def test_a_score_leaves_out_the_evaluation_before_anything_was_done(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "returns", lambda training: {0: -1000.0, 20: 1.0, 40: 3.0})
     assert module.score(Training(CONFIG, (0,), Path("trial"))) == 2.0
+    monkeypatch.setattr(module, "returns", lambda training: {0: -1000.0})
+    assert math.isnan(module.score(Training(CONFIG, (0,), Path("trial"))))
 
 
 @extras

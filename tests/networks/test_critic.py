@@ -61,7 +61,7 @@ def test_one_way_back_through_the_critics_serves_the_actor_and_themselves(key: j
     value, (by_parameter, *by_input) = jax.value_and_grad(plain, everything)(critics, observation, action)
     np.testing.assert_allclose(ours(critics, observation, action), value, rtol=1e-5)
     nothing, *mine = jax.grad(ours, everything)(critics, observation, action)
-    weighed = critics.weighed(critics.with_slopes(observation, action)[1], weights)
+    weighed = critics.weighted_gradient(critics.with_slopes(observation, action)[1], weights)
     for found, expected in ((mine, by_input), (weighed, by_parameter)):
         for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-4)

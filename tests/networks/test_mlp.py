@@ -128,7 +128,7 @@ def test_slopes_are_the_derivatives_that_differentiating_gives(key: jax.Array, w
     np.testing.assert_allclose(slopes.output, mlp(x)[:, 0], rtol=1e-6)
     by_parameter, by_input = jax.grad(weighed, argnums=(0, 1))(mlp, x)
     np.testing.assert_allclose(weights[:, None] * slopes.by_input, by_input, rtol=1e-4, atol=1e-5)
-    found = mlp.weighed(slopes, weights)
+    found = mlp.weighted_gradient(slopes, weights)
     assert jax.tree.structure(found) == jax.tree.structure(mlp)
     for mine, other in zip(jax.tree.leaves(found), jax.tree.leaves(by_parameter), strict=True):
         np.testing.assert_allclose(mine, other, rtol=1e-4, atol=1e-5)

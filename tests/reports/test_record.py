@@ -1,4 +1,4 @@
-"""What is read of a run: its hours over restarts, and what did not go as planned."""
+"""What is read of a run: its hours, and what did not go as planned."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -341,6 +341,22 @@ def test_the_clock_of_a_resumed_run_goes_on_where_it_was_saved(toy: Any, monkeyp
         assert all(before[name] <= after[name] < before[name] + 600 for name in before)
 
 
+def test_seeds_that_are_resumed_together_keep_their_own_hours(toy: Any) -> None:
+    """All but the first had gone on from the first one's clock."""
+    training, recorders = toy.toy_training([0, 1])
+    run(training, lambda: training.env_steps >= 16)
+    saved = [recorder.checkpoints[-1] for recorder in recorders]
+    facts = [
+        fact | {"clock": {name: seconds + 3600 * hours for name, seconds in fact["clock"].items()}}
+        for (_, _, fact, _), hours in zip(saved, (1, 5), strict=True)
+    ]
+    training, recorders = toy.toy_training([0, 1])
+    training.restore(saved[0][0], [arrays for _, arrays, _, _ in saved], facts)
+    training.save()
+    clocks = [recorder.checkpoints[-1][2]["clock"]["time/seconds"] for recorder in recorders]
+    assert [round(seconds / 3600) for seconds in clocks] == [1, 5]
+
+
 def test_evaluation_is_a_plain_tuple_of_what_a_callback_needs(whole: Any) -> None:
     _, _, updates = whole
     assert isinstance(updates[0].evaluation[0], Evaluation)

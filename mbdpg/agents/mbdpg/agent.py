@@ -134,7 +134,7 @@ class MBDPG:
 
         values = slopes.output.reshape(-1, c.horizon + 2, *start.weight.shape)
         critic_loss, errors = jax.value_and_grad(loss)(values)
-        critic_gradient = state.critics.weighed(slopes, errors)
+        critic_gradient = state.critics.weighted_gradient(slopes, errors)
         state = self._step_actor(self._step_critics(state, critic_gradient), gradient)
         if c.imagination_ratio > 0.0:
             state = eqx.tree_at(lambda x: x.imagined, state, self._store(state.imagined, start, imagined))

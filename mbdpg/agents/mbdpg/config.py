@@ -59,7 +59,7 @@ class Config:
     target_update_rate: float = 0.01
     """Share of the online networks that the targets take over at each of their updates (Polyak); 1 copies them."""
     target_update_every: int = 1
-    """Actor and critic updates between two updates of the targets, the paper's C."""
+    """Updates of the critics, those on real returns too, between two of the targets, the paper's C."""
     average_share: float = 0.05
     """Averages imagine and are evaluated, of dynamics and actor, with weights that fade over this share of updates."""
     target_noise: float = 0.2
