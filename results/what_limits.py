@@ -1,13 +1,15 @@
 """What a run of MBDPG is limited by, asked of its newest checkpoint alone; nothing is written, no new step is taken.
 
-    python results/what_limits.py policy RUN [--updates 4000] [--fits-per-update 1] [--planning deterministic]
+    python results/what_limits.py policy RUN [--updates 4000] [--fresh] [--fits-per-update 1] [--planning deterministic]
     python results/what_limits.py model RUN --learned 36000 [--updates 3000] [--fit-length 5 --burn-in 1]
 
 `policy` goes on learning from the replay as it is. If the real return rises, updates were missing; if what the policy
 earns in the model rises and the real return does not, it exploits the model's errors; if neither does, it is at an
-optimum of this model, and needs another model or new steps. `model` trains the dynamics afresh on the first steps and
-tests them on those that came later, which is what they are needed for: episodes of policies that they have not seen.
-Other settings of the agent's than the run's are `mbdpg train`'s flags.
+optimum of this model, and needs another model or new steps. With `--fresh` actor and critics begin anew, on the
+dynamics and steps that are there: if they come to more than the run's own, those had settled on what they saw first.
+`model` trains the dynamics afresh on the first steps and tests them on those that came later, which is what they are
+needed for: episodes of policies that they have not seen. Other settings of the agent's than the run's are `mbdpg
+train`'s flags.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ import time
 from pathlib import Path
 from typing import Any, cast
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -43,13 +46,22 @@ DREAM = 200
 """Imagined steps; rewards of the second half are compared with what an episode pays per step."""
 
 
+def actor_and_critics(state: Any) -> tuple[Any, ...]:
+    """What learns in an update of actor and critics."""
+    actors = state.actor, state.average_actor, state.target_actor, state.actor_optimizer
+    return *actors, state.critics, state.target_critics, state.critic_optimizer
+
+
 def policy(options: argparse.Namespace) -> None:
     """Go on learning, the replay as it is."""
     agent, env, replay, arrays = load(options)
-    learner, rng = Learner(agent, [0]), np.random.default_rng(0)
+    learner, rng = Learner(agent, [options.seed]), np.random.default_rng(options.seed)
+    drawn_anew = learner.state
     learner.restore([arrays])
+    if options.fresh:
+        learner.state = eqx.tree_at(actor_and_critics, learner.state, actor_and_critics(drawn_anew))
     phases = {phase.name: phase for phase in agent.phases}
-    improving, fitting = phases["improving"], phases["fitting"]
+    improving, grounding, fitting = phases["improving"], phases["grounding"], phases["fitting"]
     recent = rng.integers(replay.size - RECENT, replay.size, 256)
     starts = replay.windows(recent, improving.sampling)
     drawn = agent.config.planning == "stochastic"
@@ -70,6 +82,8 @@ def policy(options: argparse.Namespace) -> None:
             says = f"return {np.mean(played.returns):7.0f}  per step {paid:6.3f}, in the model {dreamed:6.3f}"
             print(f"{done:6,} updates  {says}", flush=True)
         learner.update(improving, [replay.sample(PER_CALL, improving.sampling, rng)], done)
+        if grounding.updates_per_step:
+            learner.update(grounding, [replay.sample(PER_CALL, grounding.sampling, rng)], done)
         fits = round(PER_CALL * options.fits_per_update)
         if fits > 0:
             learner.update(fitting, [replay.sample(fits, fitting.sampling, rng)], done)
@@ -120,6 +134,8 @@ if __name__ == "__main__":
     parser.add_argument("question", choices=("policy", "model"))
     parser.add_argument("run", type=Path)
     parser.add_argument("--updates", type=int, default=3000)
+    parser.add_argument("--fresh", action="store_true", help="actor and critics begin anew")
+    parser.add_argument("--seed", type=int, default=0, help="of batches, and of what begins anew")
     parser.add_argument("--fits-per-update", type=float, default=0.0)
     parser.add_argument("--learned", type=int, default=0, help="environment steps that the dynamics learn from")
     keep_compilations()
