@@ -41,7 +41,7 @@ def _returns(groups: Groups) -> Table:
         if shared := shared_steps(runs):
             last = [run[shared[-1]] for run in runs]
             reached = cells(summarize([one.return_mean for one in last]))
-            table.append([label, str(len(runs)), f"{shared[-1]:,}", *reached, _number(_mean_hours(last), 2)])
+            table.append([label, str(len(runs)), f"{shared[-1]:,}", *reached, _hours_of(last)])
     return table
 
 
@@ -52,9 +52,11 @@ def _hours(panel: Curves) -> Table:
     table = [
         ["", "seeds", "steps", "hours", "÷ td3", *(["paper's hours", "paper's ÷ td3"] * bool(published)), "machine"]
     ]
-    hours = {label: _mean_hours([run[shared[-1]] for run in runs]) for label, runs in groups.items() if shared}
-    for label, found in hours.items():
-        row = [label, str(len(groups[label])), f"{shared[-1]:,}", _number(found, 2), _ratio(found, hours.get("td3"))]
+    last = {label: [run[shared[-1]] for run in runs] for label, runs in groups.items() if shared}
+    hours = {label: _mean_hours(reached) for label, reached in last.items()}
+    for label, reached in last.items():
+        ratio = _ratio(hours[label], hours.get("td3"))
+        row = [label, str(len(reached)), f"{shared[-1]:,}", _hours_of(reached), ratio]
         if published:
             row += [_number(published.get(label), 1), _ratio(published.get(label), published.get("td3"))]
         machines = dict.fromkeys(machine(run.config) for run in panel.runs[label])
@@ -96,6 +98,12 @@ def _mean_hours(reached: Sequence[Evaluation]) -> float | None:
     """Over the runs that have timings."""
     known = [one.hours for one in reached if one.hours is not None]
     return float(np.mean(known)) if known else None
+
+
+def _hours_of(reached: Sequence[Evaluation]) -> str:
+    """Their mean hours, and of how many of them where some have no timings."""
+    found, known = _number(_mean_hours(reached), 2), sum(one.hours is not None for one in reached)
+    return f"{found} ({known} of {len(reached)})" if 0 < known < len(reached) else found
 
 
 def _number(value: float | None, digits: int) -> str:

@@ -89,11 +89,14 @@ def test_a_table_of_hours_is_in_multiples_of_td3(tmp_path: Path) -> None:
 
 
 def test_missing_timings_are_not_taken_for_no_time(tmp_path: Path) -> None:
-    """They counted as 0 hours, in the file and in the mean."""
+    """They counted as 0 hours, in the file and in the mean; then nothing said that the mean was of fewer."""
     timed = make(tmp_path / "a", {0: 0.0, 10: 1.0}, seconds=(0.0, 7200.0))
     runs = {"td3": [timed, make(tmp_path / "b", {0: 0.0, 10: 1.0})], "sac": [make(tmp_path / "c", {0: 0.0, 10: 1.0})]}
     lines = write_figure("table-x", [Curves("E-v0", runs)], tmp_path, as_hours=True)
-    assert [row[:5] for row in rows_in(lines)[1:]] == [["td3", "2", "10", "2.00", "1.0"], ["sac", "1", "10", "", ""]]
+    assert [row[:5] for row in rows_in(lines)[1:]] == [
+        ["td3", "2", "10", "2.00 (1 of 2)", "1.0"],
+        ["sac", "1", "10", "", ""],
+    ]
     with open(tmp_path / "table-x.csv", newline="") as file:
         assert [row["hours"] for row in csv.DictReader(file)] == ["0.0", "2.0", "", "", "", ""]
 
