@@ -74,11 +74,12 @@ def test_groups_are_drawn_side_by_side_and_one_without_an_evaluation_is_left_out
 
 
 def test_an_evaluation_in_which_every_episode_failed_is_a_gap(tmp_path: Path, drawn: list[Any]) -> None:
+    """The line went straight on."""
     failed = run_with(tmp_path / "a", {0: 1.0, 100: float("nan"), 200: 3.0})
     runs = [failed, run_with(tmp_path / "b", {0: 3.0, 100: 1.0, 200: 5.0})]
     curves.draw_curves({"mbdpg": runs}, tmp_path / "curve.png", title="")
-    assert drawn[0][:2] == ([0, 200], [1, 3])
-    assert drawn[2][:2] == ([0, 200], [2, 4])
+    for (steps, returns, _), ends in zip((drawn[0], drawn[2]), ((1, 3), (2, 4)), strict=True):
+        assert steps == [0, 100, 200] and (returns[0], returns[2]) == ends and np.isnan(returns[1])
 
 
 def test_without_any_evaluation_one_line_says_what_to_do(tmp_path: Path) -> None:
