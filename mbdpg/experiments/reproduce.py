@@ -63,14 +63,16 @@ def reproduce(
     with only_writer(out):
         if first:
             do([*first.values()])
-        lacking = [p for p in pieces if p.needs and p.needs.name in failures and not p.work.finished()]
+        lacking = {
+            p.work.name: p.needs.name for p in pieces if p.needs and p.needs.name in failures and not p.work.finished()
+        }
         if not should_stop():
-            do([*{piece.work.name: piece.work for piece in pieces if piece not in lacking}.values()])
+            do([*{p.work.name: p.work for p in pieces if p.work.name not in lacking}.values()])
         if should_stop():
             return
-        for piece in lacking:
-            failures[piece.work.name] = f"left out, it needs {piece.needs.name if piece.needs else ''}"
-            say(f"{piece.work.name}: {failures[piece.work.name]}")
+        for left, needed in lacking.items():
+            failures[left] = f"left out, it needs {needed}"
+            say(f"{left}: {failures[left]}")
         if failures:
             heading.append(f"Not finished, for it failed or was left out: {'; '.join(sorted(failures))}.")
         _draw(chosen, scale, out, heading, say)

@@ -35,9 +35,9 @@ class Critics(eqx.Module):
     def __call__(
         self, observation: Float[Array, "*batch observation"], action: Float[Array, "*batch action"]
     ) -> Float[Array, "critic *batch"]:
-        pair, rows = _paired(observation, action)
+        rows = _rows(observation, action)
         values: Array = eqx.filter_vmap(lambda mlp, x: mlp(x), in_axes=(0, None))(self.mlps, rows)
-        return values.reshape(-1, *pair.shape[:-1])
+        return values.reshape(-1, *observation.shape[:-1])
 
     def with_slopes(
         self, observation: Float[Array, "*batch observation"], action: Float[Array, "*batch action"]
@@ -48,12 +48,12 @@ class Critics(eqx.Module):
         `weighted_gradient` makes of the slopes. So the actor's loss and the critics' own cost one way through the
         critics and back.
         """
-        pair, rows = _paired(observation, action)
+        rows = _rows(observation, action)
         mlps, here = jax.lax.stop_gradient((self.mlps, rows))
         slopes: Slopes = eqx.filter_vmap(MLP.slopes, in_axes=(0, None))(mlps, here)
         zero = (rows - here)[None]  # with a derivative
         values = slopes.output + jnp.sum(slopes.by_input * zero, axis=-1)
-        return values.reshape(-1, *pair.shape[:-1]), slopes
+        return values.reshape(-1, *observation.shape[:-1]), slopes
 
     def weighted_gradient(self, slopes: Slopes, weights: Float[Array, "critic *batch"]) -> Critics:
         """The derivative of the values' weighted sum by every parameter."""
@@ -61,10 +61,7 @@ class Critics(eqx.Module):
         return eqx.tree_at(lambda x: x.mlps, self, eqx.filter_vmap(MLP.weighted_gradient)(self.mlps, slopes, rows))
 
 
-def _paired(observation: Array, action: Array) -> tuple[Array, Array]:
-    """What a critic sees, and the same as one axis of rows.
-
-    Over that XLA sums weights' gradients without first transposing what it sums.
-    """
+def _rows(observation: Array, action: Array) -> Array:
+    """What a critic sees, as one axis of rows: XLA sums weights' gradients over it without first transposing."""
     pair = jnp.concatenate([observation, action], axis=-1)
-    return pair, pair.reshape(-1, pair.shape[-1])
+    return pair.reshape(-1, pair.shape[-1])

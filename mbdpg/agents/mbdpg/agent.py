@@ -124,7 +124,6 @@ class MBDPG:
         gradient, (imagined, slopes, metrics) = jax.grad(self._actor_loss, has_aux=True)(
             state.actor, state, real, start, model_key
         )
-        imagined = jax.lax.stop_gradient(imagined)
         targets = self._targets(state, window, start, imagined, key=target_key)
         weights = imagined.survival()[:-1] * start.weight[None]
 
