@@ -168,6 +168,10 @@ def test_the_overview_names_every_verb(say: Any) -> None:
             assert f"mbdpg {verb} " in said.out
 
 
+def test_the_version_is_that_of_the_installed_package(say: Any) -> None:
+    assert say("--version").out == f"mbdpg {metadata.version('mbdpg')}\n"
+
+
 @pytest.mark.parametrize("verb", VERBS)
 def test_each_verb_s_help_explains_every_flag(say: Any, verb: str) -> None:
     said = say(verb, "--help")

@@ -6,6 +6,7 @@ import importlib
 import sys
 from collections.abc import Sequence
 
+import mbdpg
 from mbdpg.interfaces import UserError, one_line, require
 
 VERBS = ("train", "resume", "evaluate", "demonstrate", "reproduce", "sweep", "report", "benchmark")
@@ -24,7 +25,7 @@ Learn continuous control from few samples: model-based deterministic policy grad
   mbdpg report RUN...        compare runs: tables with intervals; --out report.html for curves and more
   mbdpg benchmark            measure on this machine: updates, acting, starting, memory
 
-Every verb has its own --help; --debug shows tracebacks.
+Every verb has its own --help; --debug shows tracebacks. mbdpg --version says which this is.
 """
 
 
@@ -33,6 +34,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     args = list(sys.argv[1:] if arguments is None else arguments)
     if not args or args[0] in ("-h", "--help"):
         print(OVERVIEW, end="")
+        return
+    if args[0] == "--version":
+        print(f"mbdpg {mbdpg.__version__}")
         return
     try:
         require(args[0] in VERBS, f"there is no verb {args[0]!r}; expected one of {', '.join(VERBS)}")

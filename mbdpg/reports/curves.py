@@ -10,9 +10,8 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from mbdpg.interfaces import UserError
-from mbdpg.reports.record import Curve, mean_curve, numbers
+from mbdpg.reports.record import learning_curve, mean_curve
 from mbdpg.storage.files import replace_durably
-from mbdpg.storage.metrics import read_metrics
 
 
 def draw_curves(groups: Mapping[str, Sequence[Path]], path: Path, *, title: str) -> None:
@@ -26,7 +25,10 @@ def draw_curves(groups: Mapping[str, Sequence[Path]], path: Path, *, title: str)
     Raises:
         UserError: no run has an evaluation yet, or the picture cannot be written.
     """
-    known = {label: [curve for curve in map(_curve, runs) if curve] for label, runs in groups.items()}
+    curves_of = {label: [learning_curve(run, gaps=True) for run in runs] for label, runs in groups.items()}
+    known = {
+        label: [own for own in curves if any(map(math.isfinite, own.values()))] for label, curves in curves_of.items()
+    }
     if not any(known.values()):
         raise UserError("no run has an evaluation yet; train until the first one, then draw again")
     figure = Figure(figsize=(7, 4.2), layout="constrained")
@@ -48,14 +50,3 @@ def draw_curves(groups: Mapping[str, Sequence[Path]], path: Path, *, title: str)
         replace_durably(path, picture.getvalue())  # and not what a link there points to
     except OSError as error:
         raise UserError(f"cannot write {path}: {error.strerror}") from error
-
-
-def _curve(run: Path) -> Curve:
-    """Its evaluations, NaN where all episodes of one failed; empty if they did in all of them."""
-    columns = read_metrics(run, "eval")
-    returns = numbers(columns, "eval/return_mean")
-    if all(value is None for value in returns):
-        return {}
-    return {
-        step: math.nan if value is None else value for step, value in zip(columns["env_steps"], returns, strict=True)
-    }

@@ -79,7 +79,7 @@ def _picture(panels: Panels) -> bytes:
             for axes in column[1:]:
                 axes.axis("off")
             continue
-        groups = panel.evaluations()
+        groups = panel.evaluations(gaps=True)
         _draw_curves(column[0], groups, _mean_and_std)
         _draw_curves(column[1], groups, _interquartile)
         _draw_curves(column[2], groups, _mean_and_std, count_experts=True)
@@ -123,7 +123,11 @@ def _draw_curves(
         if not shared:
             continue
         added = max(one.expert_env_steps for run in runs for one in run.values()) if count_experts else 0
-        middle, low, high = np.transpose([band([run[step].return_mean for run in runs]) for step in shared])
+        returns = ([run[step].return_mean for run in runs] for step in shared)
+        bands = [
+            band(own) if np.isfinite(own).all() else (np.nan,) * 3 for own in returns
+        ]  # a gap for all where one failed
+        middle, low, high = np.transpose(bands)
         steps = np.asarray(shared) + added
         axes.plot(steps, middle, color=f"C{number}", label=f"{label} ({_seeds(runs)})")
         axes.fill_between(steps, low, high, color=f"C{number}", alpha=0.2, linewidth=0)

@@ -32,9 +32,9 @@ class Curves:
     published_hours: Mapping[str, float] = field(default_factory=dict)
     """Of the paper's runs, by label."""
 
-    def evaluations(self) -> dict[str, list[dict[int, Evaluation]]]:
-        """Of every run, by label."""
-        return {label: [evaluations(run) for run in runs] for label, runs in self.runs.items()}
+    def evaluations(self, *, gaps: bool = False) -> dict[str, list[dict[int, Evaluation]]]:
+        """Of every run, by label; those in which every episode failed are left out or, as gaps, NaN."""
+        return {label: [_evaluations(run, gaps=gaps) for run in runs] for label, runs in self.runs.items()}
 
     def origins(self) -> dict[Path, Mapping[str, Any]]:
         """What each run records of its commit and machine, by its folder."""
@@ -64,7 +64,8 @@ class Errors:
 Panels = Sequence[Curves | Errors]
 
 
-def evaluations(run: Record) -> dict[int, Evaluation]:
-    """A run's evaluations by environment steps, but for those in which every episode failed."""
+def _evaluations(run: Record, *, gaps: bool) -> dict[int, Evaluation]:
+    """A run's by environment steps."""
     hours, experts = run.hours(), dict(zip(run.steps, run.column("expert_env_steps"), strict=True))
-    return {step: Evaluation(step, int(experts[step] or 0), mean, hours.get(step)) for step, mean in run.curve.items()}
+    curve = run.curve_with_gaps if gaps else run.curve
+    return {step: Evaluation(step, int(experts[step] or 0), mean, hours.get(step)) for step, mean in curve.items()}

@@ -16,7 +16,8 @@ from mbdpg.storage.metrics import read_metrics
 from mbdpg.storage.run_folder import RunFolder
 
 Curve = Mapping[int, float]
-"""Mean evaluation return by environment steps, without evaluations in which every episode failed."""
+"""Mean evaluation return by environment steps. Evaluations in which every episode failed are not in it, or, in a curve
+with gaps, NaN: no line is to be drawn across them."""
 
 
 class Record(NamedTuple):
@@ -43,7 +44,11 @@ class Record(NamedTuple):
 
     @property
     def curve(self) -> Curve:
-        return _curve(self.evaluations)
+        return _curve(self.evaluations, gaps=False)
+
+    @property
+    def curve_with_gaps(self) -> Curve:
+        return _curve(self.evaluations, gaps=True)
 
     @property
     def steps(self) -> list[int]:
@@ -105,13 +110,13 @@ def read_records(folders: Sequence[Path], *, leave_out: Callable[[str], None]) -
     return found
 
 
-def learning_curve(folder: Path) -> Curve:
+def learning_curve(folder: Path, *, gaps: bool = False) -> Curve:
     """The curve of a run, whose config need not be there.
 
     Raises:
         UserError: it has no rows yet, or a damaged one.
     """
-    return _curve(read_metrics(folder, "eval"))
+    return _curve(read_metrics(folder, "eval"), gaps=gaps)
 
 
 def shared_steps(curves: Iterable[Mapping[int, Any]]) -> list[int]:
@@ -159,6 +164,6 @@ def _whole(value: Any) -> Any:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
-def _curve(evaluations: Mapping[str, list[Any]]) -> Curve:
+def _curve(evaluations: Mapping[str, list[Any]], *, gaps: bool) -> Curve:
     pairs = zip(evaluations["env_steps"], numbers(evaluations, "eval/return_mean"), strict=True)
-    return {step: value for step, value in pairs if value is not None}
+    return {step: math.nan if value is None else value for step, value in pairs if gaps or value is not None}

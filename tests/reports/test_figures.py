@@ -5,11 +5,14 @@ from __future__ import annotations
 import csv
 import warnings
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from mbdpg.reports.figures import write_figure
-from mbdpg.reports.panels import Curves, Errors, evaluations
+from mbdpg.reports.panels import Curves, Errors
 from mbdpg.reports.record import Record
 from mbdpg.storage.metrics import MetricsLog
 from mbdpg.storage.run_folder import RunFolder
@@ -42,9 +45,32 @@ def errors(path: Path, scale: float) -> Path:
 
 def test_hours_go_on_over_failed_evaluations(tmp_path: Path) -> None:
     run = make(tmp_path / "run", {0: 1.0, 10: None, 20: 3.0, 30: 4.0}, seconds=(360.0, 720.0, 900.0, 1080.0), expert=7)
-    found = evaluations(run)
+    [found] = Curves("E-v0", {"td3": [run]}).evaluations()["td3"]
     assert list(found) == [0, 20, 30] and {one.expert_env_steps for one in found.values()} == {7}
     assert [one.hours for one in found.values()] == pytest.approx([0.1, 0.25, 0.3])
+
+
+def test_no_line_or_band_crosses_an_evaluation_that_failed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They went straight on, as if it had been between the others."""
+    seeds = [make(tmp_path / f"seed-{i}", {0: 1.0, 10: 2.0, 20: 3.0, 30: 4.0}) for i in range(4)]
+    seeds.append(make(tmp_path / "seed-4", {0: 1.0, 10: None, 20: 3.0, 30: 4.0}))
+    rows: list[Any] = []
+
+    def note(figure: Figure, *_: Any, save: Any = Figure.savefig, **settings: Any) -> None:
+        rows.extend(figure.axes)
+        save(figure, *_, **settings)
+
+    monkeypatch.setattr(Figure, "savefig", note)
+    lines = write_figure("figure-x", [Curves("E-v0", {"td3": seeds})], tmp_path)
+    assert len(rows) == 3
+    for axes in rows:
+        [line] = axes.get_lines()
+        assert line.get_xdata().tolist() == [0, 10, 20, 30]
+        np.testing.assert_array_equal(line.get_ydata(), [1.0, np.nan, 3.0, 4.0])
+        assert len(axes.collections[0].get_paths()) == 2  # before it and after it
+    assert rows_in(lines)[1][:4] == ["td3", "5", "30", "4.0"]
+    with open(tmp_path / "figure-x.csv", newline="") as file:
+        assert [row["env_steps"] for row in csv.DictReader(file) if row["seed"] == "4"] == ["0", "20", "30"]
 
 
 def test_a_figure_has_its_numbers_beside_it(tmp_path: Path) -> None:
