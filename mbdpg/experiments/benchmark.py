@@ -20,6 +20,7 @@ import jax
 import numpy as np
 
 from mbdpg.agents import mbdpg
+from mbdpg.experiments.compilations import LEAST_SECONDS
 from mbdpg.experiments.config import RunConfig
 from mbdpg.experiments.origin import machine
 from mbdpg.experiments.products import matrix_products, median_seconds, product_seconds
@@ -131,7 +132,7 @@ def _starting(say: Say) -> dict[str, float]:
     """A fresh process up to its first updates, with nothing compiled before and then with everything; its memory."""
     result: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as cache:
-        keep = {"JAX_COMPILATION_CACHE_DIR": cache, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.3"}
+        keep = {"JAX_COMPILATION_CACHE_DIR": cache, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": str(LEAST_SECONDS)}
         code = "import sys, mbdpg.cli.train; from mbdpg.experiments import benchmark; benchmark.start(*sys.argv[1:])"
         settings = json.dumps(dataclasses.asdict(DEFAULTS))
         for name in ("cold_start_s", "warm_start_s"):

@@ -13,7 +13,7 @@ import jax
 
 from mbdpg.storage.run_folder import describe_machine
 
-LEAST_SECONDS = 0.3
+LEAST_SECONDS = 0.02
 """What compiles faster is not worth a file."""
 
 

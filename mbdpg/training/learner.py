@@ -35,20 +35,24 @@ class Learner:
         Raises:
             MemoryError: the states alone are larger than this machine's memory, at which XLA would abort the process.
         """
-        state = jax.eval_shape(lambda key: agent.init(key=key), jax.random.key(0))
+        state = jax.eval_shape(lambda: agent.init(key=jax.random.key(0)))
         size = len(seeds) * sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
         if size > os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"):
             raise MemoryError(f"the networks and their optimizers take {size / 2**30:.0f} GiB")
         self.agent = agent
-        self._keys = jax.vmap(jax.random.key)(jnp.asarray(seeds, jnp.uint32))
-        init_keys = jax.vmap(jax.random.fold_in, (0, None))(self._keys, 0)
         mesh = seed_mesh(len(seeds), jax.local_devices() if devices is None else devices)
+        numbers: Any = np.asarray(seeds, np.uint32)
         if devices is not None:
-            init_keys = jax.device_put(init_keys, NamedSharding(mesh, _seed_axis()))
-        self.state = jax.jit(over_seeds(lambda key: agent.init(key=key), mesh))(init_keys)
+            numbers = jax.device_put(numbers, NamedSharding(mesh, _seed_axis()))
+
+        def begin(seed: jax.Array) -> tuple[jax.Array, Any]:
+            key = jax.random.key(seed)
+            return key, agent.init(key=jax.random.fold_in(key, 0))
+
+        self._keys, self.state = jax.jit(over_seeds(begin, mesh))(numbers)
         self._prepare = jax.jit(over_seeds(agent.prepare, mesh), donate_argnums=0)
         self._diagnose = jax.jit(over_seeds(agent.diagnose, mesh))
-        self._updates = {phase.name: _compile(phase, mesh) for phase in agent.phases}
+        self._updates = {phase.name: _compile(phase, 1 + i, mesh) for i, phase in enumerate(agent.phases)}
 
     def prepare(self, statistics: Sequence[Statistics]) -> None:
         """Set each seed's scaling."""
@@ -60,9 +64,8 @@ class Learner:
         Returns:
             Means over the steps, one array of shape (seed,) per metric.
         """
-        keys = jax.vmap(jax.random.fold_in, (0, None))(self._keys, 1 + self.agent.phases.index(phase))
         self.state, metrics = self._updates[phase.name](
-            self.state, _stack(batches), keys, np.full(len(keys), done, np.uint32)
+            self.state, _stack(batches), self._keys, np.full(len(self._keys), done, np.uint32)
         )
         return {name: np.asarray(value) for name, value in metrics.items()}
 
@@ -143,12 +146,15 @@ def _one_by_one(function: Any) -> Any:
     return lambda *args: jax.lax.map(lambda packed: function(*packed), args)
 
 
-def _compile(phase: Phase, mesh: Mesh) -> Any:
+def _compile(phase: Phase, stream: int, mesh: Mesh) -> Any:
+    """Gradient steps of a phase, each with the random numbers of its own stream and count."""
+
     def many(state: Any, batches: Batch, key: Any, done: Any) -> tuple[Any, Metrics]:
         def one(carry: Any, inputs: tuple[Any, Batch]) -> tuple[Any, Metrics]:
             step, batch = inputs
-            return phase.update(carry, batch, key=jax.random.fold_in(key, step))
+            return phase.update(carry, batch, key=jax.random.fold_in(own, step))
 
+        own = jax.random.fold_in(key, stream)
         steps = done + jnp.arange(batches.reward.shape[0], dtype=jnp.uint32)
         state, metrics = jax.lax.scan(one, state, (steps, batches))
         return state, jax.tree.map(lambda x: jnp.mean(x.astype(jnp.float32)), metrics)
