@@ -23,7 +23,7 @@ from typing import (
 import numpy as np
 
 Metrics = dict[str, Any]
-"""Names as in docs/metrics.md, to numbers (or, under jit, scalar arrays)."""
+"""Names as in docs/metrics.md, to numbers or lists of them (under jit, scalar arrays)."""
 
 
 class UserError(Exception):

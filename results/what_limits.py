@@ -122,7 +122,7 @@ def model(options: argparse.Namespace) -> None:
 
 def load(options: argparse.Namespace) -> tuple[MBDPG, Environment, Replay, dict[str, np.ndarray]]:
     """The run's agent with other settings, its environment, its replay and the arrays of its newest checkpoint."""
-    config, checkpoint = RunConfig.from_json(RunFolder.open(options.run).config), load_checkpoint(options.run)
+    config, checkpoint = RunConfig.of(RunFolder.open(options.run)), load_checkpoint(options.run)
     require(isinstance(config.agent, Config), f"{options.run} is of {config.algorithm}, expected mbdpg")
     env = config.make_env()
     agent = MBDPG(tyro.cli(Config, args=options.settings, default=cast(Config, config.agent)), env.spec)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Literal
 
 import equinox as eqx
@@ -113,7 +113,7 @@ class MBPO:
         """
         c = self.config = config
         self.env = env
-        self._sac = sac.SAC(sac.Config(**{f.name: getattr(c, f.name) for f in fields(sac.Config)}), env)
+        self._sac = sac.SAC(c, env)
         self._rule = RULES[known_rule(env)] if c.termination == "known" else None
         rates = (c.model_learning_rate, c.weight_decay)
         self._fitting = Fitting(c.members, c.model_width, *rates, c.fit_batch_size, judged=True)

@@ -54,8 +54,6 @@ def expanded_values(
         target = reward + discount * alive * ((1.0 - share) * next_value + share * after)
         return target, target
 
-    if rewards.shape[0] == 0:
-        return rewards
     steps = (rewards, continues, next_values, jnp.full(rewards.shape, trace, rewards.dtype))
     return jax.lax.scan(step, next_values[-1], steps, reverse=True)[1]
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import tyro
 
-from mbdpg.cli.flags import EnvArgument, parse
+from mbdpg.cli.flags import EnvArgument, parse, program
 from mbdpg.experiments import expert
 from mbdpg.experiments.compilations import keep_compilations
 from mbdpg.experiments.config import EnvOptions
@@ -16,6 +18,7 @@ from mbdpg.experiments.run import train
 from mbdpg.experiments.stopping import Stop
 from mbdpg.interfaces import require
 from mbdpg.reports.console import RunDisplay
+from mbdpg.training.randomness import checked_seeds
 
 
 @dataclass(frozen=True)
@@ -45,11 +48,18 @@ def demonstrate(args: list[str]) -> None:
     """Run the verb."""
     flags = parse(Demonstrate, "demonstrate", args)
     keep_compilations()
-    make_demonstrations(flags)
+    make_demonstrations(flags, args)
 
 
-def make_demonstrations(flags: Demonstrate) -> None:
-    """Train the expert unless there is one, then record."""
+def make_demonstrations(flags: Demonstrate, args: Sequence[str], *, then: str = "") -> None:
+    """Train the expert unless there is one, then record.
+
+    Args:
+        flags: what is wanted.
+        args: what makes the same of `mbdpg demonstrate`, to be said where it is interrupted.
+        then: what is to be done after that.
+    """
+    checked_seeds([flags.seed])
     require(flags.episodes >= 1, f"--episodes is {flags.episodes}, expected at least 1")
     success = expert.success_in(flags.env, flags.env_options, flags.success_return)
     run = flags.expert
@@ -59,15 +69,14 @@ def make_demonstrations(flags: Demonstrate) -> None:
         require(
             not trained.exists(),
             f"{trained} has an expert already: take it with --expert {trained}, after more training if it needs that "
-            f"(mbdpg resume {trained} --steps N), or choose another --out",
+            f"({program()} resume {trained} --steps N), or choose another --out",
         )
         config = expert.config_of(flags.env, flags.steps, flags.env_options)
         with Stop() as stop:
             with RunDisplay(flags.steps) as display:
                 run = train(config, seeds=[flags.seed], out=folder, on_update=display, should_stop=stop)[0]
-            stop.exit_if_asked(
-                f"mbdpg resume {run}, then mbdpg demonstrate {flags.env} --out {flags.out} --expert {run}"
-            )
+            again = f"{program()} demonstrate {shlex.join(args)} --expert {run}"
+            stop.exit_if_asked(f"{program()} resume {run}, then {again}{then}")
     found = expert.record_from(
         run,
         flags.env,

@@ -45,7 +45,7 @@ def evaluate(args: list[str]) -> None:
     require(flags.episodes >= 1, f"--episodes is {flags.episodes}, expected at least 1")
     require(flags.seed >= 0, f"--seed is {flags.seed}, expected at least 0")
     folder = RunFolder.open(flags.run)
-    config = RunConfig.from_json(folder.config)
+    config = RunConfig.of(folder)
     require(not folder.config.get("custom_env"), f"{flags.run} trained an environment made in code: use mbdpg.evaluate")
     # Nobody but the person at the keyboard may decide that code is imported.
     options = dataclasses.replace(config.env_options, allow_import=flags.allow_import)

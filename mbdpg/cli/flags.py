@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import io
 import re
 import shutil
 import sys
+import time
 from collections.abc import Sequence
+from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
-from mbdpg.interfaces import one_line
+from mbdpg.experiments import presets
+from mbdpg.experiments.config import CONFIGS, EnvOptions, RunConfig
+from mbdpg.interfaces import one_line, require
+from mbdpg.training.loop import Schedule
 
 RunArgument = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
 EnvArgument = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ENV")]
@@ -47,6 +53,65 @@ def program() -> str:
     """What to type for this program where it was started."""
     called = Path(sys.argv[0])
     return str(called) if called.name == "mbdpg" and not shutil.which("mbdpg") else "mbdpg"
+
+
+def run_flags(verb: str, purpose: str, options: type[Any], args: list[str]) -> Any:
+    """What a verb is told that trains, over a preset's settings: `env`, `run` (its options), and those of a RunConfig.
+
+    The options have `algorithm` and `preset`, which decide what other flags there are and their defaults.
+    """
+    algorithm, preset = peek(args, "algorithm", "mbdpg"), peek(args, "preset", "default")
+    schedule, env_options = presets.run_settings(preset)
+    agent = presets.agent_config(algorithm, preset, args[0] if args else None)
+    flat: Any = tyro.conf.OmitArgPrefixes
+    known = set[str]().union(*map(_names, (options, Schedule, EnvOptions, type(agent))))
+    for flag in (arg.partition("=")[0] for arg in args if arg.startswith("--")):
+        name = flag[2:].replace("-", "_").removeprefix("no_")
+        others = [other for other, kind in CONFIGS.items() if name in _names(kind)]
+        wrong = f"{flag} is no setting of {algorithm}, but of {' and '.join(others)}"
+        require(name in known or not others, f"{wrong}; see mbdpg {verb} --algorithm {algorithm} --help")
+
+    def told(agent: Any) -> Any:
+        command = dataclasses.make_dataclass(
+            verb.capitalize(),
+            [
+                ("env", Annotated[EnvArgument, tyro.conf.arg(help="Gymnasium id, as in HalfCheetah-v5.")]),
+                ("run", flat[options], field(default_factory=options)),
+                ("schedule", flat[Schedule], field(default=schedule)),
+                ("env_options", flat[EnvOptions], field(default=env_options)),
+                ("agent", flat[type(agent)], field(default=agent)),
+            ],
+            frozen=True,
+        )
+        command.__doc__ = purpose
+        return parse(command, verb, args)
+
+    flags = told(agent)
+    own = presets.agent_config(algorithm, preset, flags.env)
+    return flags if own == agent else told(own)  # where the task's id stands elsewhere
+
+
+def _names(kind: type[Any]) -> set[str]:
+    """Of a dataclass's fields."""
+    return {field.name for field in dataclasses.fields(kind)}
+
+
+def default_folder(parent: str, config: RunConfig) -> Path:
+    """PARENT/ENV-ALGORITHM-TIME."""
+    name = re.sub(r"[^A-Za-z0-9.-]+", "-", config.env)
+    return Path(parent) / f"{name}-{config.algorithm}-{time.strftime('%Y%m%d-%H%M%S')}"
+
+
+def as_flags(settings: Any) -> list[str]:
+    """What to type for those settings of a dataclass that are not the defaults."""
+    flags: list[str] = []
+    for own in dataclasses.fields(settings):
+        value, name = getattr(settings, own.name), own.name.replace("_", "-")
+        if value != own.default:
+            flags += (
+                [f"--{name}" if value else f"--no-{name}"] if isinstance(value, bool) else [f"--{name}", str(value)]
+            )
+    return flags
 
 
 def _plain(text: str) -> str:

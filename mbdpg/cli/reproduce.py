@@ -14,7 +14,7 @@ from mbdpg.cli.places import Places, engine_of, made, say
 from mbdpg.experiments.reproduce import reproduce as reproduce_study
 from mbdpg.experiments.stopping import Stop
 from mbdpg.experiments.studies import ScaleName, StudyName
-from mbdpg.interfaces import require
+from mbdpg.training.randomness import checked_seeds
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class Reproduce:
 def reproduce(args: list[str]) -> None:
     """Run the verb."""
     flags = parse(Reproduce, "reproduce", args)
-    require(all(0 <= seed < 2**31 for seed in flags.seeds), f"--seeds are {flags.seeds}, expected from 0 to 2^31 - 1")
-    require(len(set(flags.seeds)) == len(flags.seeds), f"--seeds are {flags.seeds}, expected different ones")
+    if flags.seeds:
+        checked_seeds(flags.seeds)
     engine = engine_of(flags.places)
     out = made(flags.out or Path("studies") / flags.scale, "a folder of studies")
     with Stop() as stop:

@@ -15,7 +15,6 @@ from mbdpg.experiments.compilations import keep_compilations
 from mbdpg.experiments.config import RunConfig
 from mbdpg.experiments.stopping import Stop
 from mbdpg.reports.console import RunDisplay
-from mbdpg.storage.run_folder import RunFolder
 
 
 @dataclass(frozen=True)
@@ -53,5 +52,4 @@ def resume(args: list[str]) -> None:
 
             resuming.resume(runs, steps=flags.steps, allow_import=flags.allow_import, watch=display, should_stop=stop)
         stop.exit_if_asked(f"{program()} resume {flags.run}")
-    config = RunFolder.open(runs[0]).config
-    finish(runs, config["algorithm"], config["env"])
+    finish(runs)

@@ -9,15 +9,15 @@ from typing import Annotated, Any
 
 import tyro
 
-from mbdpg.cli.flags import program
+from mbdpg.cli.flags import default_folder, program, run_flags
 from mbdpg.cli.places import Places, engine_of, made, say
-from mbdpg.cli.train import default_folder, run_flags
 from mbdpg.experiments import presets
 from mbdpg.experiments.config import Algorithm, RunConfig
 from mbdpg.experiments.search import Search
 from mbdpg.experiments.stopping import Stop
 from mbdpg.experiments.sweep import sweep as search_settings
 from mbdpg.interfaces import require
+from mbdpg.training.randomness import checked_seeds
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,7 @@ def sweep(args: list[str]) -> None:
     config = RunConfig(flags.env, flags.agent, flags.schedule, flags.env_options)
     require(run.trials >= 1, f"--trials is {run.trials}, expected at least 1")
     require(len(run.search) > 0, "nothing is searched; say what with --search, for example --search horizon=1:20")
-    different = 0 < len(run.seeds) == len(set(run.seeds)) and all(0 <= seed < 2**31 for seed in run.seeds)
-    require(different, f"--seeds are {list(run.seeds)}, expected numbers from 0 to 2^31 - 1, all different")
+    checked_seeds(run.seeds)
     searches = [Search.parse(text, config.agent) for text in run.search]
     require(len({search.name for search in searches}) == len(searches), "--search has a setting twice")
     config.make_env().close()  # a wrong task is better said once than by every trial

@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-import re
-import time
+from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
-
-import tyro
 
 from mbdpg.cli.demonstrate import Demonstrate, make_demonstrations
-from mbdpg.cli.flags import EnvArgument, parse, peek, program
+from mbdpg.cli.flags import as_flags, default_folder, program, run_flags
 from mbdpg.experiments import presets, run
 from mbdpg.experiments.compilations import keep_compilations
-from mbdpg.experiments.config import CONFIGS, Algorithm, EnvOptions, RunConfig
+from mbdpg.experiments.config import Algorithm, RunConfig
 from mbdpg.experiments.stopping import Stop
-from mbdpg.interfaces import require
 from mbdpg.reports.console import RunDisplay
-from mbdpg.training.loop import Schedule
+from mbdpg.reports.record import read_records
+from mbdpg.storage.run_folder import RunFolder
 
 
 @dataclass(frozen=True)
@@ -49,7 +45,9 @@ def train(args: list[str]) -> None:
     out = flags.run.out or default_folder("runs", config)
     if flags.run.demonstrations == "expert":
         file = out / "demonstrations.safetensors"
-        make_demonstrations(Demonstrate(flags.env, file, seed=flags.run.seeds[0], env_options=flags.env_options))
+        teacher = Demonstrate(flags.env, file, seed=flags.run.seeds[0], env_options=flags.env_options)
+        again = [flags.env, "--out", str(file), "--seed", str(teacher.seed), *as_flags(flags.env_options)]
+        make_demonstrations(teacher, again, then=f", then this again with --demonstrations {file}")
         config = dataclasses.replace(config, demonstrations=str(file))
     elif flags.run.demonstrations != "none":
         config = dataclasses.replace(config, demonstrations=flags.run.demonstrations)
@@ -57,61 +55,19 @@ def train(args: list[str]) -> None:
         with RunDisplay(config.schedule.steps) as display:
             runs = run.train(config, seeds=flags.run.seeds, out=out, on_update=display, should_stop=stop)
         stop.exit_if_asked(f"{program()} resume {out}")
-    finish(runs, config.algorithm, config.env)
+    finish(runs)
 
 
-def run_flags(verb: str, purpose: str, options: type[Any], args: list[str]) -> Any:
-    """What a verb is told that trains, over a preset's settings: `env`, `run` (its options), and those of a RunConfig.
-
-    The options have `algorithm` and `preset`, which decide what other flags there are and their defaults.
-    """
-    algorithm, preset = peek(args, "algorithm", "mbdpg"), peek(args, "preset", "default")
-    schedule, env_options = presets.run_settings(preset)
-    agent = presets.agent_config(algorithm, preset, args[0] if args else None)
-    flat: Any = tyro.conf.OmitArgPrefixes
-    known = set[str]().union(*map(_names, (options, Schedule, EnvOptions, type(agent))))
-    for flag in (arg.partition("=")[0] for arg in args if arg.startswith("--")):
-        name = flag[2:].replace("-", "_").removeprefix("no_")
-        others = [other for other, kind in CONFIGS.items() if name in _names(kind)]
-        wrong = f"{flag} is no setting of {algorithm}, but of {' and '.join(others)}"
-        require(name in known or not others, f"{wrong}; see mbdpg {verb} --algorithm {algorithm} --help")
-
-    def told(agent: Any) -> Any:
-        command = dataclasses.make_dataclass(
-            verb.capitalize(),
-            [
-                ("env", Annotated[EnvArgument, tyro.conf.arg(help="Gymnasium id, as in HalfCheetah-v5.")]),
-                ("run", flat[options], field(default_factory=options)),
-                ("schedule", flat[Schedule], field(default=schedule)),
-                ("env_options", flat[EnvOptions], field(default=env_options)),
-                ("agent", flat[type(agent)], field(default=agent)),
-            ],
-            frozen=True,
-        )
-        command.__doc__ = purpose
-        return parse(command, verb, args)
-
-    flags = told(agent)
-    own = presets.agent_config(algorithm, preset, flags.env)
-    return flags if own == agent else told(own)  # where the task's id stands elsewhere
-
-
-def _names(kind: type[Any]) -> set[str]:
-    """Of a dataclass's fields."""
-    return {field.name for field in dataclasses.fields(kind)}
-
-
-def default_folder(parent: str, config: RunConfig) -> Path:
-    """PARENT/ENV-ALGORITHM-TIME."""
-    name = re.sub(r"[^A-Za-z0-9.-]+", "-", config.env)
-    return Path(parent) / f"{name}-{config.algorithm}-{time.strftime('%Y%m%d-%H%M%S')}"
-
-
-def finish(runs: Sequence[Path], algorithm: str, env: str) -> None:
-    """Draw the learning curve beside the run folders and say what to do next."""
+def finish(runs: Sequence[Path]) -> None:
+    """Draw the learning curves of these runs and of all beside them on the same task; say what to do next."""
     from mbdpg.reports.curves import draw_curves  # not before: Matplotlib is a fifth of all modules' time
 
-    folder = runs[0].parent
-    draw_curves({algorithm: runs}, folder / "learning-curve.png", title=env)
+    folder, env = runs[0].absolute().parent, RunFolder.open(runs[0]).config["env"]
+    beside = sorted(config.parent for config in folder.glob("*/config.json"))
+    groups: dict[str, list[Path]] = defaultdict(list)
+    for record in read_records(beside, leave_out=lambda why: None):
+        if record.config.get("env") == env:
+            groups[str(record.config.get("algorithm"))].append(record.folder)
+    draw_curves(groups, folder / "learning-curve.png", title=env)
     print(f"done: {folder}, learning curve in {folder / 'learning-curve.png'}")
     print(f"next: {program()} evaluate {runs[0]} --episodes 10 --video {folder / 'policy.mp4'}")

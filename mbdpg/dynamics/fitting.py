@@ -27,12 +27,7 @@ class Window(NamedTuple):
     valid: Float[Array, "*batch time"]
 
 
-def warm_memory(
-    dynamics: Dynamics,
-    observations: Float[Array, "batch time observation"],
-    actions: Float[Array, "batch time action"],
-    valid: Float[Array, "batch time"],
-) -> Memory:
+def warm_memory(dynamics: Dynamics, past: Window) -> Memory:
     """The memory after real steps, teacher-forced from zeros; steps that are not valid leave it at zero."""
 
     def step(memory: Memory, inputs: tuple[Array, Array, Array]) -> tuple[Memory, None]:
@@ -40,8 +35,8 @@ def warm_memory(
         new = dynamics.remember(memory, observation, action)
         return Memory(new.hidden * exists[:, None], new.cell * exists[:, None]), None
 
-    time_first = (jnp.swapaxes(observations, 0, 1), jnp.swapaxes(actions, 0, 1), jnp.swapaxes(valid, 0, 1))
-    return jax.lax.scan(step, dynamics.initial_memory(valid.shape[:1]), time_first)[0]
+    inputs = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), (past.observation, past.action, past.valid))
+    return jax.lax.scan(step, dynamics.initial_memory(past.valid.shape[:1]), inputs)[0]
 
 
 def open_loop(
@@ -105,8 +100,7 @@ def dynamics_loss(
     imagined ones: learned between imagined ends, the reward for a leg that touches the ground is paid at every step in
     which it may have touched. Steps after an episode's end do not count.
     """
-    lead = slice(0, burn_in)
-    memory = warm_memory(dynamics, window.observation[:, lead], window.action[:, lead], window.valid[:, lead])
+    memory = warm_memory(dynamics, jax.tree.map(lambda x: x[:, :burn_in], window))
     future = jax.tree.map(lambda x: jnp.swapaxes(x[:, burn_in:], 0, 1), window)
     actions = jnp.swapaxes(future.action, 0, 1)
     prediction, imagined, memories = open_loop(dynamics, scales, future.observation[0], memory, actions)
@@ -141,8 +135,7 @@ def dynamics_loss(
 
 def open_loop_error(dynamics: Dynamics, scales: Scales, window: Window, *, burn_in: int) -> Float[Array, "time 2"]:
     """`mbdpg.dynamics.accuracy.errors_over_time` of the mixture's mean, over steps whose past is in the window."""
-    lead = slice(0, burn_in)
-    memory = warm_memory(dynamics, window.observation[:, lead], window.action[:, lead], window.valid[:, lead])
+    memory = warm_memory(dynamics, jax.tree.map(lambda x: x[:, :burn_in], window))
     start = window.observation[:, burn_in]
     imagined = open_loop(dynamics, scales, start, memory, window.action[:, burn_in:])[1]
     truth, exists = window.next_observation[:, burn_in:], window.valid[:, burn_in:]

@@ -16,7 +16,7 @@ from mbdpg.dynamics.termination import RULES
 from mbdpg.networks.leaves import leaf_name
 
 MOST = 10**9
-"""A stranger's planner may not take more numbers than this for a layer, nor more rows of them for a plan."""
+"""A stranger's planner may not take more numbers than this for its layers, nor more rows of them for a plan."""
 
 
 def cross_entropy(
@@ -170,13 +170,14 @@ class PlanningPolicy:
         return np.clip(self(observation) + noise, -1.0, 1.0).astype(np.float32)
 
 
-_NUMBERS = ("horizon", "particles", "population", "plan_elites", "iterations", "smoothing", "discount")
+_COUNTS, _SHARES = ("horizon", "particles", "population", "plan_elites", "iterations"), ("smoothing", "discount")
 _HIDDEN = "ensemble/members/hidden/"
 
 
 def planner_arrays(planner: Planner) -> dict[str, np.ndarray]:
     """A planner as named arrays, for a policy file."""
-    arrays = {f"planner/{name}": np.asarray(getattr(planner, name)) for name in _NUMBERS}
+    arrays = {f"planner/{name}": np.asarray(getattr(planner, name)) for name in _COUNTS}
+    arrays |= {f"planner/{name}": np.asarray(getattr(planner, name), np.float64) for name in _SHARES}
     arrays["planner/rule"] = np.frombuffer((planner.rule or "").encode(), np.uint8)
     leaves = jax.tree_util.tree_leaves_with_path(planner)
     return arrays | {leaf_name(path): np.asarray(leaf) for path, leaf in leaves}
@@ -194,7 +195,7 @@ def planner_of(arrays: Mapping[str, np.ndarray]) -> Planner:
         ValueError: an array is missing, misshapen or not finite, or a setting is impossible.
     """
     try:
-        numbers = {name: arrays[f"planner/{name}"].item() for name in _NUMBERS}
+        numbers = {name: arrays[f"planner/{name}"].item() for name in (*_COUNTS, *_SHARES)}
         rule = arrays["planner/rule"].tobytes().decode("ascii") or None
         layers = sum(name.startswith(_HIDDEN) and name.endswith("/weight") for name in arrays)
         count, inputs, _ = arrays[f"{_HIDDEN}0/weight"].shape
@@ -202,9 +203,8 @@ def planner_of(arrays: Mapping[str, np.ndarray]) -> Planner:
         (size,) = arrays["units/delta"].shape
     except (KeyError, IndexError, ValueError) as error:
         raise ValueError(f"the planner is not whole ({error})") from error
-    whole = [numbers[name] for name in _NUMBERS[:5]]
-    shares = [numbers["smoothing"], numbers["discount"]]
-    possible = all(type(x) is int and x > 0 for x in whole) and all(type(x) is float and 0 <= x <= 1 for x in shares)
+    counts, shares = ([numbers[name] for name in names] for names in (_COUNTS, _SHARES))
+    possible = all(type(x) is int and x > 0 for x in counts) and all(type(x) is float and 0 <= x <= 1 for x in shares)
     if not possible or numbers["plan_elites"] > numbers["population"] or inputs <= size or rule not in (None, *RULES):
         raise ValueError(f"the planner has the impossible settings {numbers}, rule {rule!r}")
     rows = count * numbers["particles"] * numbers["population"]

@@ -10,7 +10,8 @@ from typing import Any, Literal
 
 from mbdpg import envs
 from mbdpg.agents import mbdpg, mbpo, pets, sac, td3
-from mbdpg.interfaces import require
+from mbdpg.interfaces import UserError, require
+from mbdpg.storage.run_folder import RunFolder
 from mbdpg.training.loop import Schedule
 
 AgentConfig = mbdpg.Config | td3.Config | sac.Config | pets.Config | mbpo.Config
@@ -82,6 +83,18 @@ class RunConfig:
         return env
 
     @classmethod
+    def of(cls, run: RunFolder) -> RunConfig:
+        """That of a run.
+
+        Raises:
+            UserError: as `from_json`; it names the run.
+        """
+        try:
+            return cls.from_json(run.config)
+        except UserError as error:
+            raise UserError(f"{run.path} cannot be used, {error}; put its config.json back as it was") from error
+
+    @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> RunConfig:
         """Read what a run's config.json holds.
 
@@ -104,6 +117,9 @@ class RunConfig:
         )
 
 
+_KINDS = {bool: "true or false", int: "a whole number", float: "a number"}
+
+
 def _settings(kind: type[Any], data: Any, name: str) -> Any:
     """A config dataclass from JSON, refusing what it does not know and what has another type than its default."""
     known = {field.name: field.default for field in dataclasses.fields(kind)}
@@ -116,5 +132,6 @@ def _settings(kind: type[Any], data: Any, name: str) -> Any:
         value, number = data[key], (int, float)
         kinds = (*number, type(None)) if default is None else number if isinstance(default, float) else type(default)
         fits = isinstance(value, kinds) and (isinstance(default, bool) or not isinstance(value, bool))
-        require(fits, f"config.json has {name}.{key} = {str(value)[:40]!r}")
+        kind_of = "a number or null" if default is None else _KINDS.get(type(default), "text")
+        require(fits, f"config.json has {name}.{key} = {str(value)[:40]!r}, expected {kind_of}")
     return kind(**data)

@@ -78,7 +78,7 @@ class ModelFit:
         """
         refuse_made_otherwise(self.out, self._settings())
         keep_compilations()
-        config, steps = RunConfig.from_json(RunFolder.open(self.data).config), Recorded.load(self.data, self.data_steps)
+        config, steps = RunConfig.of(RunFolder.open(self.data)), Recorded.load(self.data, self.data_steps)
         env = config.make_env()
         agent, rng = MBDPG(self.agent, env.spec), np.random.default_rng(self.seed)
         env.close()

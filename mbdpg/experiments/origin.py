@@ -25,11 +25,19 @@ def machine(seeds: int = 1) -> dict[str, Any]:
 
 
 def _commit() -> str | None:
-    """The commit of the checkout this package runs from, with a + if it has changes; None elsewhere."""
-    git = ["git", "-C", str(Path(__file__).parent)]
+    """The commit of the checkout this package runs from, with a + if it has changes; None elsewhere.
+
+    Elsewhere is also where it is installed within another repository, whose commit says nothing of it.
+    """
+
+    def git(*words: str) -> subprocess.CompletedProcess[str]:
+        command = ["git", "-C", str(Path(__file__).parent), *words]
+        return subprocess.run(command, capture_output=True, text=True, timeout=5)
+
     try:
-        commit = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5)
-        changes = subprocess.run([*git, "status", "--porcelain", "-uno"], capture_output=True, text=True, timeout=5)
+        tracked = git("ls-files", "--error-unmatch", Path(__file__).name)
+        commit, changes = git("rev-parse", "HEAD"), git("status", "--porcelain", "-uno")
     except (OSError, subprocess.TimeoutExpired):
         return None
-    return commit.stdout.strip() + ("+" if changes.stdout.strip() else "") if commit.returncode == 0 else None
+    known = tracked.returncode == commit.returncode == 0
+    return commit.stdout.strip() + ("+" if changes.stdout.strip() else "") if known else None

@@ -94,15 +94,15 @@ def _pieces(chosen: Study, scale: Scale, groups: Sequence[tuple[int, ...]], out:
     for panel in chosen.panels:
         for cell in panel.cells:
             shown = _demonstrating(cell, scale, out) if cell.demonstrated else None
-            found += [_Piece(_training(cell, seeds, scale, out), shown) for seeds in groups]
+            found += [_Piece(_training(cell, shown, seeds, out), shown) for seeds in groups]
         for model in panel.models:
             recorded = _recording(model, scale, out)
             found += [_Piece(_fitting(model, seed, scale, out), recorded) for seed in scale.seeds]
     return found
 
 
-def _training(cell: Cell, seeds: tuple[int, ...], scale: Scale, out: Path) -> Training:
-    demonstrations = str(_demonstrating(cell, scale, out).file) if cell.demonstrated else None
+def _training(cell: Cell, shown: Demonstrating | None, seeds: tuple[int, ...], out: Path) -> Training:
+    demonstrations = str(shown.file) if shown else None
     return Training(dataclasses.replace(cell.config, demonstrations=demonstrations), seeds, out / cell.folder)
 
 
@@ -136,8 +136,7 @@ def _fitting(model: Model, seed: int, scale: Scale, out: Path) -> ModelFit:
 def _teacher(like: RunConfig, steps: int, scale: Scale) -> RunConfig:
     """TD3 on the same task."""
     config = expert.config_of(like.env, steps, like.env_options)
-    tiny = {name: value for name, value in scale.tiny.items() if hasattr(config.agent, name)}
-    return dataclasses.replace(config, agent=dataclasses.replace(config.agent, **tiny))
+    return dataclasses.replace(config, agent=scale.shrunk(config.agent))
 
 
 def _command(name: StudyName, scale_name: ScaleName, seeds: Sequence[int], engine: Engine) -> str:
@@ -157,7 +156,8 @@ def _draw(chosen: Study, scale: Scale, out: Path, heading: Sequence[str], say: C
                 files[model.label] = {fit.out: origin_of(fit.out) for fit in fits if fit.finished()}
             panels.append(Errors(panel.title, {label: found for label, found in files.items() if found}))
         else:
-            done = {cell.label: _training(cell, scale.seeds, scale, out).done() for cell in panel.cells}
+            shown_to = {c.label: _demonstrating(c, scale, out) if c.demonstrated else None for c in panel.cells}
+            done = {c.label: _training(c, shown_to[c.label], scale.seeds, out).done() for c in panel.cells}
             runs = {label: [Record.read(run, root=out) for run in found] for label, found in done.items()}
             shown = {label: found for label, found in runs.items() if found}
             panels.append(Curves(panel.title, shown, panel.published_hours))

@@ -77,10 +77,7 @@ class _Saved(NamedTuple):
 def _saved(path: Path, stack: contextlib.ExitStack, has_env: bool, steps: int | None, allow_import: bool) -> _Saved:
     """Lock and read a run."""
     folder = RunFolder.open(path)
-    try:
-        config = RunConfig.from_json(folder.config)
-    except UserError as error:
-        raise UserError(f"{path} cannot be resumed, {error}; put its config.json back as it was") from error
+    config = RunConfig.of(folder)
     config = dataclasses.replace(config, env_options=dataclasses.replace(config.env_options, allow_import=allow_import))
     if folder.config.get("custom_env") and not has_env:
         raise UserError(f"{path} trained an environment made in code; resume it with mbdpg.resume(..., env=...)")

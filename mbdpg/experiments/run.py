@@ -22,6 +22,7 @@ from mbdpg.storage.run_folder import RunFolder
 from mbdpg.training.collector import Collector
 from mbdpg.training.learner import Learner
 from mbdpg.training.loop import Training, Update
+from mbdpg.training.randomness import checked_seeds
 from mbdpg.training.replay import Replay
 
 MakeEnvironment = Callable[[], Environment]
@@ -53,9 +54,7 @@ def train(
     Raises:
         UserError: something the caller can mend; then no folder is left behind.
     """
-    given = f"--seeds are {list(seeds)}, expected"
-    require(len(seeds) > 0 and len(set(seeds)) == len(seeds), f"{given} one number or more, all different")
-    require(all(0 <= seed < 2**31 for seed in seeds), f"{given} numbers from 0 to 2^31 - 1")
+    seeds = checked_seeds(seeds)
     make = make_env or config.make_env
     spec = spec_of(make)
     demonstrations = Demonstrations.load(Path(config.demonstrations), spec) if config.demonstrations else None

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from mbdpg.agents import mbdpg
 from mbdpg.dynamics.aggregation import Aggregation
-from mbdpg.experiments.config import EnvOptions, RunConfig
+from mbdpg.experiments.config import AgentConfig, EnvOptions, RunConfig
 from mbdpg.experiments.presets import PAPER_EPISODE_LIMIT, Preset, agent_config
 from mbdpg.training.loop import Schedule
 
@@ -60,6 +60,11 @@ class Scale:
     """Settings of every agent that has them."""
     success_share: float = 1.0
     """Least return of an expert's success, as a share of the return at which the task counts as solved."""
+
+    def shrunk(self, agent: AgentConfig, **settings: Any) -> Any:
+        """Settings of an agent, `tiny` where it has them and none is given."""
+        known = {field.name for field in dataclasses.fields(agent)}
+        return dataclasses.replace(agent, **({n: v for n, v in self.tiny.items() if n in known} | settings))
 
 
 SCALES: dict[ScaleName, Scale] = {
@@ -160,10 +165,9 @@ def _cell(scale: Scale, env: str, label: str = "mbdpg", algorithm: str = "mbdpg"
     """Runs of an algorithm with some settings; `preset` and `demonstrated` are not the agent's."""
     preset, demonstrated = settings.pop("preset", "default"), settings.pop("demonstrated", False)
     agent = agent_config(algorithm, preset, env)
-    settings = {name: value for name, value in scale.tiny.items() if hasattr(agent, name)} | settings
     size = ANT_OBSERVATION if env.startswith("Ant") else None
     options = EnvOptions(max_episode_steps=PAPER_EPISODE_LIMIT, observation_size=size)
-    return Cell(label, RunConfig(env, dataclasses.replace(agent, **settings), scale.schedule, options), demonstrated)
+    return Cell(label, RunConfig(env, scale.shrunk(agent, **settings), scale.schedule, options), demonstrated)
 
 
 def _panels(tasks: Sequence[str], scale: Scale) -> tuple[Panel, ...]:
@@ -203,10 +207,9 @@ def _table_1(scale: Scale) -> Study:
 def _model(
     scale: Scale, label: str, aggregation: Aggregation = "none", *, env: str = RECORDED, **settings: Any
 ) -> Model:
-    agent = dataclasses.replace(mbdpg.Config(), **(FAR | settings))
-    tiny = {name: value for name, value in scale.tiny.items() if hasattr(agent, name) and name not in settings}
+    agent = scale.shrunk(mbdpg.Config(), **(FAR | settings))
     members = 1 if aggregation == "none" else mbdpg.Config().gaussians
-    return Model(label, env, dataclasses.replace(agent, **tiny), aggregation, members)
+    return Model(label, env, agent, aggregation, members)
 
 
 def _figure_6(scale: Scale) -> Study:

@@ -183,7 +183,7 @@ def _as_text(settings: Mapping[str, Any]) -> str:
 
 def _is_of(run: Path, config: RunConfig) -> bool:
     """Whether a run folder is of this configuration; its length may differ, and the place of its demonstrations."""
-    found = RunConfig.from_json(RunFolder.open(run).config)
+    found = RunConfig.of(RunFolder.open(run))
     if config.demonstrations and found.demonstrations:
         found = dataclasses.replace(found, demonstrations=config.demonstrations)
     return (

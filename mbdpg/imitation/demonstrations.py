@@ -25,7 +25,7 @@ class Demonstrations:
     expert_env_steps: int
     """Environment steps that the expert learned from, and those of the episodes recorded or discarded."""
     facts: dict[str, Any]
-    """Success rule, returns and origin."""
+    """Success rule, returns, episodes tried and seed."""
 
     def save(self, path: Path) -> None:
         """Write them.

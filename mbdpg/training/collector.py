@@ -93,11 +93,16 @@ class Collector:
         if self.baseline is not None:
             del self.returns[:-RECENT]
 
+    @property
+    def recent_return(self) -> float | None:
+        """Mean return of the last training episodes; None before the first has ended."""
+        return float(np.mean(self.returns[-RECENT:])) if self.returns else None
+
     def progress(self, reference_return: float | None) -> float:
         """How far the last training returns are on the way from a random policy's to the reference, in [0, 1]."""
-        if reference_return is None or self.baseline is None or not self.returns:
+        recent = self.recent_return
+        if reference_return is None or self.baseline is None or recent is None:
             return 0.0
-        recent = float(np.mean(self.returns[-RECENT:]))
         span = max(reference_return - self.baseline, 1e-6)
         return float(np.clip((recent - self.baseline) / span, 0.0, 1.0))
 

@@ -100,11 +100,14 @@ def _episode(
 def realized_returns(steps: Replay, discount: float) -> np.ndarray:
     """Discounted return from every step of finished episodes to their end, float32.
 
-    NaN shortly before a truncation (299 steps at discount 0.99), where too much of what would follow was not seen.
+    NaN shortly before a truncation (299 steps at discount 0.99, all with discount 1), where too much of what would
+    follow was not seen.
     """
     columns = steps.columns()
     result = np.full(steps.size, np.nan, np.float32)
-    tail = math.ceil(math.log(UNSEEN) / math.log(discount)) if 0.0 < discount < 1.0 else 0
+    tail = steps.size if discount == 1.0 else 0
+    if 0.0 < discount < 1.0:
+        tail = math.ceil(math.log(UNSEEN) / math.log(discount))
     value, known = 0.0, 0
     for row in range(steps.size - 1, -1, -1):
         if columns["terminated"][row]:

@@ -185,7 +185,8 @@ class Training:
         # At rate 0 nothing comes after the first updates, so calls of a size that leaves none of them over.
         chunk = max(1, round(rate * cycle)) if rate else math.gcd(phase.first_updates, cycle)
         first = math.ceil(phase.first_updates / chunk) * chunk
-        due = first + int((self.env_steps - phase.after_steps) * rate)
+        # Rounded first: 50 * 0.58 is a little less than 29, and would leave a call to the next cycle for ever.
+        due = first + int(round((self.env_steps - phase.after_steps) * rate, 6))
         while (done := self._updates[phase.name]) + chunk <= due and not should_stop():
             batches = [
                 c.replay.sample(chunk, phase.sampling, random_stream(c.seed, phase.name, done)) for c in self.collectors
@@ -250,10 +251,7 @@ class Training:
                 "gradient_steps": sum(self._updates.values()),
             }
             if collector.returns:
-                row |= {
-                    "train/episode_return": collector.returns[-1],
-                    "train/return_mean": np.mean(collector.returns[-10:]),
-                }
+                row |= {"train/episode_return": collector.returns[-1], "train/return_mean": collector.recent_return}
             recorder.write("train", self.env_steps, row | self._clock(index))
             self._sums[index] = {}
 

@@ -152,7 +152,7 @@ class Replay:
 
     def statistics(self, progress: float) -> Statistics:
         """Moments of all steps so far, as float32."""
-        return self._moments.statistics(progress)._replace(steps=np.float32(self.size - self.demonstrated))
+        return self._moments.statistics(progress, self.size - self.demonstrated)
 
 
 def _problem_with(columns: Mapping[str, np.ndarray]) -> str | None:
@@ -206,7 +206,7 @@ class _Moments:
             self._reward[2] += reward
             self._reward[3] += reward * reward
 
-    def statistics(self, progress: float) -> Statistics:
+    def statistics(self, progress: float, steps: int) -> Statistics:
         n = max(self._count, 1)
         mean, square, change, change_square = self._observation / n
         alive = max(self._count - self._terminal_count, 1)
@@ -221,7 +221,7 @@ class _Moments:
             terminal_reward_scale=np.float32(terminal if terminal > CONSTANT else 1.0),
             return_scale=_spread(np.asarray(self._reward[0] / n)),
             progress=np.float32(progress),
-            steps=np.float32(self._count),
+            steps=np.float32(steps),
         )
 
 

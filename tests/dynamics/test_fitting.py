@@ -125,8 +125,8 @@ def test_the_loss_is_numpys_sum_over_steps(dynamics: MixtureDynamics) -> None:
     w.terminated[0, BURN_IN + 1] = 1
     w.valid[0, BURN_IN + 2 :] = 0
     w.valid[1, 0] = 0
-    observation, action, valid = (jnp.asarray(x) for x in (w.observation, w.action, w.valid))
-    memory = warm_memory(dynamics, observation[:, :BURN_IN], action[:, :BURN_IN], valid[:, :BURN_IN])
+    observation, action = jnp.asarray(w.observation), jnp.asarray(w.action)
+    memory = warm_memory(dynamics, jax.tree.map(lambda x: jnp.asarray(x[:, :BURN_IN]), w))
     p, reached, memories = open_loop(dynamics, SCALES, observation[:, BURN_IN], memory, action[:, BURN_IN:])
     steps = (w.observation, w.action, w.next_observation)
     before, taken, after = (jnp.swapaxes(jnp.asarray(x[:, BURN_IN:]), 0, 1) for x in steps)
@@ -188,7 +188,7 @@ def test_burning_in_fills_the_memory_with_the_episodes_own_steps(dynamics: Mixtu
     w = jax.tree.map(jnp.asarray, window(batch=4))
     starts = np.array([0, 1, 4, TIME])  # of the last, the window holds nothing yet
     valid = jnp.asarray(np.arange(TIME) >= starts[:, None], jnp.float32)
-    memory = warm_memory(dynamics, w.observation, w.action, valid)
+    memory = warm_memory(dynamics, w._replace(valid=valid))
     for i, start in enumerate(starts):
         by_hand = dynamics.initial_memory(())
         for t in range(start, TIME):
@@ -198,7 +198,7 @@ def test_burning_in_fills_the_memory_with_the_episodes_own_steps(dynamics: Mixtu
 
 
 def test_no_burn_in_leaves_the_memory_empty(dynamics: MixtureDynamics) -> None:
-    memory = warm_memory(dynamics, jnp.zeros((2, 0, O)), jnp.zeros((2, 0, A)), jnp.zeros((2, 0)))
+    memory = warm_memory(dynamics, jax.tree.map(lambda x: jnp.asarray(x[:, :0]), window(batch=2)))
     assert memory.hidden.shape == (2, 4) and not memory.hidden.any() and not memory.cell.any()
 
 
@@ -221,8 +221,7 @@ def test_open_loop_error_is_numpys_beside_that_of_no_change(dynamics: MixtureDyn
     w.valid[1, 0] = 0
     w = jax.tree.map(jnp.asarray, w)
     errors = open_loop_error(dynamics, SCALES, w, burn_in=BURN_IN)
-    past = slice(0, BURN_IN)
-    memory = warm_memory(dynamics, w.observation[:, past], w.action[:, past], w.valid[:, past])
+    memory = warm_memory(dynamics, jax.tree.map(lambda x: x[:, :BURN_IN], w))
     start = w.observation[:, BURN_IN]
     reached = open_loop(dynamics, SCALES, start, memory, w.action[:, BURN_IN:])[1]
     for depth, rows in ((1, [0, 1, 2]), (3, [1, 2])):

@@ -94,13 +94,12 @@ class MBDPG:
             "dynamics/grad_norm": optax.tree.norm(gradient),
             "dynamics/skipped": optimizer_state.total_notfinite,
         }
-        average = self._average(state.average_dynamics, dynamics, state.fits)
-        state = eqx.tree_at(
-            lambda x: (x.dynamics, x.average_dynamics, x.dynamics_optimizer, x.fits),
+        average = self._average(state.average_dynamics, dynamics, state.dynamics_optimizer)
+        return eqx.tree_at(
+            lambda x: (x.dynamics, x.average_dynamics, x.dynamics_optimizer),
             state,
-            (dynamics, average, optimizer_state, state.fits + 1),
-        )
-        return state, metrics
+            (dynamics, average, optimizer_state),
+        ), metrics
 
     def clone(self, state: State, batch: Batch, *, key: PRNGKeyArray) -> tuple[State, Metrics]:
         """Learn critics (Eq. 14) and actor (Eq. 15) from a batch of demonstrated transitions."""
@@ -129,7 +128,7 @@ class MBDPG:
 
         def loss(values: Array) -> Array:
             total = objectives.critic_loss(values[:, 0], targets[0], jnp.ones_like(targets[0]))
-            return total + c.imagined_weight * objectives.critic_loss(values[:, 1:-1], targets[1], weights)
+            return total + c.imagined_weight * objectives.critic_loss(values[:, 1:-1], targets[1:], weights)
 
         values = slopes.output.reshape(-1, c.horizon + 2, *start.weight.shape)
         critic_loss, errors = jax.value_and_grad(loss)(values)
@@ -192,20 +191,19 @@ class MBDPG:
     def _step_actor(self, state: State, gradient: Policy) -> State:
         updates, optimizer_state = self._optimizers.actor.update(gradient, state.actor_optimizer)
         actor = optax.apply_updates(state.actor, updates)
-        average = self._average(state.average_actor, actor, optax.tree.get(state.actor_optimizer, "count"))
+        average = self._average(state.average_actor, actor, state.actor_optimizer)
         return eqx.tree_at(
             lambda x: (x.actor, x.average_actor, x.actor_optimizer), state, (actor, average, optimizer_state)
         )
 
-    def _average(self, average: Any, newest: Any, count: Array) -> Any:
-        """Move to the newest so that weights fade over `average_share` of the updates, `count` before this one."""
-        return optax.incremental_update(
-            newest, average, 1.0 / (1.0 + self.config.average_share * count.astype(jnp.float32))
-        )
+    def _average(self, average: Any, newest: Any, optimizer: Any) -> Any:
+        """Move to the newest so that weights fade over `average_share` of the updates that the optimizer counted."""
+        before = optax.tree.get(optimizer, "count").astype(jnp.float32)
+        return optax.incremental_update(newest, average, 1.0 / (1.0 + self.config.average_share * before))
 
     def _start(self, state: State, window: Window, *, key: PRNGKeyArray) -> Start:
         """Where imagination starts: after each real transition, or for a share of them in the imagination buffer."""
-        memory = warm_memory(state.average_dynamics, window.observation, window.action, window.valid)
+        memory = warm_memory(state.average_dynamics, window)
         memory = jax.lax.stop_gradient(memory)
         alive = 1.0 - window.terminated[:, -1]
         real = Start(window.next_observation[:, -1], memory, alive, jnp.zeros_like(alive))
@@ -255,24 +253,23 @@ class MBDPG:
         metrics = {"actor/objective": mean, "actor/saturation": saturation, "actor/survival": jnp.mean(survival[-1])}
         return c.saturation_penalty * saturation - mean / size, (imagined, slopes, metrics)
 
-    def _targets(
-        self, state: State, window: Window, start: Start, imagined: Trajectory, *, key: PRNGKeyArray
-    ) -> tuple[Array, Array]:
-        """What the critics are taught: at the real transitions, shape (batch,), and along the imagined ones."""
+    def _targets(self, state: State, window: Window, start: Start, imagined: Trajectory, *, key: PRNGKeyArray) -> Array:
+        """What the critics are taught at the real transitions, then along the imagined ones: shape (H + 1, batch)."""
         c = self.config
         noise_key, real_key = jax.random.split(key)
         # With trace 1 no value but the last is read.
         seen = imagined.observations if c.trace < 1.0 else imagined.observations[-1:]
         values = self._target_value(state, seen, key=noise_key)
         values = jnp.broadcast_to(values, imagined.observations.shape[:-1])
-        expanded = objectives.expanded_values(imagined.rewards, imagined.continues, values[1:], c.discount, c.trace)
-        # The real step is the expansion's first, and without a horizon its only one.
-        after = (1.0 - c.trace) * values[0] + c.trace * expanded[0] if c.horizon > 0 else values[0]
+        trace = jnp.full_like(values, c.trace)
         if c.imagination_ratio > 0.0:  # where imagination went on from elsewhere, the transition has one step
+            elsewhere = start.depth > 0.0
             one_step = self._target_value(state, window.next_observation[:, -1], key=real_key)
-            after = jnp.where(start.depth == 0.0, after, one_step)
-        reward = state.real_reward(window)[:, -1]
-        return objectives.temporal_difference_target(reward, window.terminated[:, -1], after, c.discount), expanded
+            values = values.at[0].set(jnp.where(elsewhere, one_step, values[0]))
+            trace = trace.at[0].set(jnp.where(elsewhere, 0.0, trace[0]))
+        rewards = jnp.concatenate([state.real_reward(window)[:, -1:].T, imagined.rewards])
+        continues = jnp.concatenate([1.0 - window.terminated[:, -1:].T, imagined.continues])
+        return objectives.expanded_values(rewards, continues, values, c.discount, trace)
 
     def _store(self, ring: Ring, start: Start, imagined: Trajectory) -> Ring:
         """Keep where imagination ended, with weight 0 (nothing starts there) if it went too deep."""

@@ -85,7 +85,7 @@ class Config:
     fit_length: int = 5
     """Open-loop steps L that the dynamics are trained over."""
     burn_in: int = 1
-    """Real steps that fill the memory before the one that open-loop training or imagination starts from."""
+    """Real steps that fill the memory before the step that training begins to predict, or imagination goes on from."""
     fit_batch_size: int = 64
     """Windows per dynamics update."""
     fits_per_step: float = 0.5

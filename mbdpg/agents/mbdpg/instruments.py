@@ -33,10 +33,7 @@ def measure(config: Config, state: State, window: Window, realized_return: Float
         window: `burn_in` steps, then as many as the greatest depth, of evaluation episodes.
         realized_return: discounted return that followed the first step after the burn-in, NaN where unknown.
     """
-    past = slice(0, config.burn_in)
-    memory = warm_memory(
-        state.average_dynamics, window.observation[:, past], window.action[:, past], window.valid[:, past]
-    )
+    memory = warm_memory(state.average_dynamics, jax.tree.map(lambda x: x[:, : config.burn_in], window))
     now = window.observation[:, config.burn_in]
     value = objectives.clipped_value(state.critics(now, window.action[:, config.burn_in])) * state.return_scale
     imagined = _imagine(state, state.average_actor, now, memory, depth=max(DEPTHS), printed=False)

@@ -44,8 +44,6 @@ class State(eqx.Module):
     beta: Float[Array, ""]
     std: Float[Array, ""]
     """Of the behavior policy."""
-    fits: Int[Array, ""]
-    """Updates of the dynamics so far."""
     updates: Int[Array, ""]
     """Updates of the critics so far."""
 
@@ -116,6 +114,5 @@ def initial_state(config: Config, env: EnvSpec, optimizers: Optimizers, *, key: 
         imagined=Ring.empty(slots, Start(jnp.zeros(o), dynamics.initial_memory(()), zero, zero)),
         beta=jnp.asarray(config.beta, jnp.float32),
         std=jnp.asarray(config.exploration_std, jnp.float32),
-        fits=jnp.zeros((), jnp.int32),
         updates=jnp.zeros((), jnp.int32),
     )
