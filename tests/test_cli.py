@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -101,6 +102,23 @@ def test_train_then_resume_then_evaluate(say: Any, toys: None, tmp_path: Path) -
     again = say("evaluate", tmp_path / "run" / "seed-4", "--episodes", "2", "--best")
     assert again.out == said.out
     assert say("evaluate", tmp_path / "run" / "seed-4", "--episodes", "2", "--best", "--seed", "1").out != said.out
+
+
+def test_one_seed_that_goes_on_keeps_the_others_in_the_picture(say: Any, toys: None, monkeypatch: Any) -> None:
+    """It was drawn alone over the picture of all of them, and from within its folder, into that."""
+    say("train", "Pendulum-v1", *TINY, "--seeds", "0", "4", "--out", "run")
+    drawn: list[Any] = []
+    monkeypatch.setattr("mbdpg.reports.curves.draw_curves", lambda *given, **_: drawn.append(given))
+    for name in ("other", "damaged"):
+        shutil.copytree("run/seed-0", f"run/{name}")
+    config = Path("run/other/config.json")
+    config.write_text(config.read_text().replace("Pendulum-v1", "Other-v1"))
+    Path("run/damaged/config.json").write_text("{")
+    whole = Path.cwd() / "run"
+    monkeypatch.chdir("run/seed-4")
+    said = say("resume", ".", "--steps", "60")
+    assert said.status == 0, said.err
+    assert drawn == [({"td3": [whole / "seed-0", whole / "seed-4"]}, whole / "learning-curve.png")]
 
 
 def test_without_out_a_run_gets_a_folder_named_after_what_it_is(say: Any, toys: None) -> None:
@@ -245,8 +263,8 @@ def test_an_unknown_verb_is_answered_with_the_known_ones(say: Any) -> None:
             ("Pendulum-v1", "--algorithm", "ppo"),
             "unknown --algorithm 'ppo'; expected one of mbdpg, td3, sac, pets, mbpo",
         ),
-        (("Pendulum-v1", "--seeds", "1", "1"), "--seeds are [1, 1], expected one number or more, all different"),
-        (("Pendulum-v1", "--seeds", "-1"), "--seeds are [-1], expected numbers from 0"),
+        (("Pendulum-v1", "--seeds", "1", "1"), "--seeds are [1, 1], expected whole numbers from 0 to 2^31 - 1, one or"),
+        (("Pendulum-v1", "--seeds", "-1"), "--seeds are [-1], expected whole numbers from 0"),
         (("Pendulum-v1", "--max-episode-steps", "0"), "--max-episode-steps is 0"),
         (("Pendulum-v1", "--observation-size", "27"), "only Ant-v5 lets you choose"),
         (("Pendulum-v1", "--reference-return", "nan"), "--reference-return is nan, expected a finite number"),
@@ -331,6 +349,7 @@ def test_an_evaluation_that_cannot_be_is_refused(say: Any, trained: Path, flags:
     [
         (("Humanoid-v5",), "nobody knows what a success in Humanoid-v5 is; say so with --success-return"),
         (("Pendulum-v1", "--episodes", "0"), "--episodes is 0"),
+        (("Pendulum-v1", "--expert", "missing", "--seed", "-1"), "--seed is -1, expected a whole number from 0 to 2^"),
         (("Pendulum-v1", "--steps", "30"), "--steps is 30"),
         (("Pendulum-v1", "--success-return", "nan"), "--success-return is nan, expected a finite number"),
         (("Pendulum-v1", "--expert", "missing"), "missing"),
@@ -347,8 +366,8 @@ def test_demonstrations_that_cannot_be_are_refused_before_an_expert_is_trained(s
     ("flags", "said"),
     [
         (("figure-6", "--workers", "0"), "--workers is 0, expected at least 1"),
-        (("figure-6", "--seeds", "-1"), "--seeds are (-1,), expected from 0 to 2^31 - 1"),
-        (("figure-6", "--seeds", "1", "1"), "--seeds are (1, 1), expected different ones"),
+        (("figure-6", "--seeds", "-1"), "--seeds are [-1], expected whole numbers from 0 to 2^31 - 1"),
+        (("figure-6", "--seeds", "1", "1"), "--seeds are [1, 1], expected whole numbers from 0 to 2^31 - 1, one or"),
         (("figure-6", "--address", "127.0.0.1:6379"), "--address, --gpus need --engine ray"),
         (("figure-6", "--engine", "ray", "--workers", "2"), "--workers is for this machine alone"),
         (("figure-6", "--out", "file"), "file cannot be a folder of studies"),
@@ -391,6 +410,27 @@ def test_a_study_that_is_stopped_says_how_to_go_on(say: Any, monkeypatch: pytest
     said = say("reproduce", "figure-8", "--scale", "smoke", "--seeds", "3")
     assert said == Said(143, "", "mbdpg: saved; go on with: mbdpg reproduce figure-8 --scale smoke --seeds 3\n")
     assert given == ["figure-8", "smoke", Path.cwd() / "studies" / "smoke", Local()]
+
+
+def test_an_expert_that_is_stopped_says_how_to_go_on_with_all_that_was_given(say: Any, monkeypatch: Any) -> None:
+    """Flags that were given were not in what it said to type, nor the training that it was for."""
+
+    def stopped(config: Any, *, seeds: Any, out: Path, should_stop: Any, **others: Any) -> list[Path]:
+        should_stop.signal = 15
+        return [out / f"seed-{seeds[0]}"]
+
+    monkeypatch.setattr("mbdpg.cli.demonstrate.train", stopped)
+    flags = "Ant-v5 --out good.safetensors --observation-size 27 --success-return 9 --seed 3"
+    go_on = "mbdpg: saved; go on with: mbdpg resume"
+    said = say("demonstrate", *flags.split())
+    run = "good-expert/seed-3"
+    assert said == Said(143, "", f"{go_on} {run}, then mbdpg demonstrate {flags} --expert {run}\n")
+    said = say(
+        "train", "Ant-v5", "--observation-size", "27", "--seeds", "4", "--demonstrations", "expert", "--out", "x"
+    )
+    run, file = "x/demonstrations-expert/seed-4", "x/demonstrations.safetensors"
+    again = f"mbdpg demonstrate Ant-v5 --out {file} --seed 4 --observation-size 27 --expert {run}"
+    assert said == Said(143, "", f"{go_on} {run}, then {again}, then this again with --demonstrations {file}\n")
 
 
 def test_an_expert_of_another_environment_is_refused(say: Any, trained: Path) -> None:

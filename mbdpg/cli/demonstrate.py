@@ -18,7 +18,6 @@ from mbdpg.experiments.run import train
 from mbdpg.experiments.stopping import Stop
 from mbdpg.interfaces import require
 from mbdpg.reports.console import RunDisplay
-from mbdpg.training.randomness import checked_seeds
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,7 @@ def make_demonstrations(flags: Demonstrate, args: Sequence[str], *, then: str = 
         args: what makes the same of `mbdpg demonstrate`, to be said where it is interrupted.
         then: what is to be done after that.
     """
-    checked_seeds([flags.seed])
+    require(0 <= flags.seed < 2**31, f"--seed is {flags.seed}, expected a whole number from 0 to 2^31 - 1")
     require(flags.episodes >= 1, f"--episodes is {flags.episodes}, expected at least 1")
     success = expert.success_in(flags.env, flags.env_options, flags.success_return)
     run = flags.expert

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Sequence
+from collections.abc import Iterable
 from functools import lru_cache
 from typing import Any
 
@@ -12,15 +12,16 @@ import numpy as np
 from mbdpg.interfaces import UserError, require
 
 
-def checked_seeds(seeds: Sequence[Any]) -> list[int]:
+def checked_seeds(seeds: Iterable[Any]) -> list[int]:
     """Seeds as plain integers.
 
     Raises:
         UserError: they are not whole numbers from 0 to 2^31 - 1, one or more and all different.
     """
-    wrong = f"--seeds are {list(seeds)}, expected whole numbers from 0 to 2^31 - 1, one or more and all different"
+    given = list(seeds)
+    wrong = f"--seeds are {given}, expected whole numbers from 0 to 2^31 - 1, one or more and all different"
     try:
-        found = [operator.index(seed) for seed in seeds]
+        found = [operator.index(seed) for seed in given]
     except TypeError as error:
         raise UserError(wrong) from error
     require(0 < len(found) == len(set(found)) and all(0 <= seed < 2**31 for seed in found), wrong)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mbdpg.agents.pets import PETS, Config
-from mbdpg.dynamics.planning import PlanningPolicy
+from mbdpg.dynamics.planning import PlanningPolicy, planner_arrays, planner_of
 from mbdpg.interfaces import Batch, EnvSpec
 from mbdpg.training.learner import Learner
 from mbdpg.training.replay import Replay
@@ -30,6 +30,14 @@ def test_it_plans_with_its_settings_and_all_it_has_learned() -> None:
     assert planner.ensemble is world.ensemble
     again, _, std = agent(exploration_std=0.3).behavior(world)
     assert float(std) == np.float32(0.3) and again.rule is None
+
+
+def test_a_policy_of_whole_numbers_for_shares_is_read_again() -> None:
+    """`PETSConfig(discount=1)` trained, and its own policy was refused as impossible."""
+    one = agent(discount=1, smoothing=0)
+    planner, _ = one.policy(one.init(key=jax.random.key(0)))
+    back = planner_of(planner_arrays(planner))
+    assert (back.discount, back.smoothing) == (1.0, 0.0)
 
 
 def test_instruments_are_of_the_model_alone() -> None:

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from mbdpg.agents import td3
-from mbdpg.experiments import resuming, run
+from mbdpg.experiments import origin, resuming, run
 from mbdpg.experiments.config import EnvOptions, RunConfig
 from mbdpg.interfaces import EnvSpec, Step, UserError
 from mbdpg.storage import RunFolder
@@ -433,6 +433,24 @@ def test_seeds_that_are_none_are_refused(seeds: list[int], tmp_path: Path) -> No
     with pytest.raises(UserError, match="seeds are"):
         run.train(TOY, seeds=seeds, out=tmp_path / "run", make_env=Toy)
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("ours", [True, False])
+def test_a_commit_is_noted_only_of_our_own_checkout(ours: bool, tmp_path: Path, monkeypatch: Any) -> None:
+    """Installed within somebody's repository, runs were noted as made by that one's commit."""
+    package = tmp_path / ".venv" / "mbdpg"
+    package.mkdir(parents=True)
+    (package / "origin.py").touch()
+    (tmp_path / "mine.txt").touch()
+    identity = ("-c", "user.name=a", "-c", "user.email=a@b")
+    for words in (
+        ("init", "-q"),
+        ("add", "-f", "mine.txt", *([".venv"] * ours)),
+        (*identity, "commit", "-qm", "first"),
+    ):
+        subprocess.run(["git", "-C", tmp_path, *words], check=True)
+    monkeypatch.setattr(origin, "__file__", str(package / "origin.py"))
+    assert (origin.origin()["commit"] is not None) == ours
 
 
 def test_a_policy_is_refused_where_it_does_not_fit(toy_run: Path, tmp_path: Path) -> None:

@@ -138,6 +138,12 @@ def test_realized_returns_near_a_time_limit_are_unknown(discount: float, tail: i
     assert discount**tail < 0.05 < discount ** (tail - 1)
 
 
+def test_without_a_discount_all_of_what_a_time_limit_cut_is_unknown() -> None:
+    """It counted as known, though as much may have been to come as was there."""
+    replay, _ = steps_of((400, "truncated"), (3, "terminated"))
+    np.testing.assert_array_equal(np.isnan(realized_returns(replay, 1.0)), [True] * 400 + [False] * 3)
+
+
 def test_realized_returns_of_an_open_episode_do_not_leak_into_the_one_before() -> None:
     replay, reward = steps_of((2, "terminated"), (3, "open"))
     found = realized_returns(replay, 0.9)

@@ -222,6 +222,13 @@ def test_a_rate_below_one_update_per_cycle_is_kept_on_average(counts: Any) -> No
     assert [count["slow"] for count in counts(Phase("slow", 0.1, 0, DRAW))] == [0, 0, 1, 1, 2]
 
 
+def test_a_rate_whose_product_is_just_below_a_whole_number_loses_no_cycle(counts: Any) -> None:
+    """5 * 0.58 * 10 is 28.999999999999996: the first cycle had none, and all others were one call behind."""
+    assert 50 * 0.58 < 29
+    found = counts(Phase("rounded", 5.8, 0, DRAW), random_steps=0)
+    assert [count["rounded"] for count in found] == [0, 29, 58, 87, 116]
+
+
 def test_first_updates_are_all_taken_though_they_are_not_a_multiple_of_anything(counts: Any) -> None:
     assert [count["clone"] for count in counts(Phase("clone", 0.0, 5, DRAW, 7), random_steps=5)] == [0, 7, 7, 7, 7]
     assert [count["clone"] for count in counts(Phase("clone", 0.0, 5, DRAW, 3), random_steps=5)] == [0, 3, 3, 3, 3]

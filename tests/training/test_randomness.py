@@ -1,11 +1,27 @@
-"""Exploration noise has the color that it is asked for."""
+"""Seeds are what they must be, and exploration noise has the color that it is asked for."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
 
-from mbdpg.training.randomness import noise_block
+from mbdpg.interfaces import UserError
+from mbdpg.training.randomness import checked_seeds, noise_block
+
+
+def test_seeds_may_be_numpys_and_become_plain() -> None:
+    """They ended in a TypeError of JSON's."""
+    found = checked_seeds(np.arange(3))
+    assert found == [0, 1, 2] and {type(seed) for seed in found} == {int}
+
+
+@pytest.mark.parametrize("seeds", [[0.5], ["0"], [None], [], [1, 1], [-1], [2**31]], ids=str)
+def test_other_seeds_are_refused(seeds: list[Any]) -> None:
+    """One of 0.5 began a run that nothing could go on with."""
+    with pytest.raises(UserError, match="expected whole numbers from 0"):
+        checked_seeds(seeds)
 
 
 @pytest.mark.parametrize("color", [0.0, 1.0, 2.0])
