@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import platform
 import shutil
 import subprocess
 import sys
@@ -186,8 +187,10 @@ def test_the_overview_names_every_verb(say: Any) -> None:
             assert f"mbdpg {verb} " in said.out
 
 
-def test_the_version_is_that_of_the_installed_package(say: Any) -> None:
-    assert say("--version").out == f"mbdpg {metadata.version('mbdpg')}\n"
+def test_the_version_is_said_with_those_that_a_report_of_a_fault_needs(say: Any) -> None:
+    said = say("--version").out
+    assert said.startswith(f"mbdpg {mbdpg.__version__}, jax {metadata.version('jax')}, ")
+    assert said.endswith(f", python {platform.python_version()}\n")
 
 
 @pytest.mark.parametrize("verb", VERBS)

@@ -6,8 +6,8 @@ import importlib
 import sys
 from collections.abc import Sequence
 
-import mbdpg
 from mbdpg.interfaces import UserError, one_line, require
+from mbdpg.storage.run_folder import describe_machine
 
 VERBS = ("train", "resume", "evaluate", "demonstrate", "reproduce", "sweep", "report", "benchmark")
 """Each is a function in a file of its name, read when it is called for: none waits for what another needs."""
@@ -25,7 +25,7 @@ Learn continuous control from few samples: model-based deterministic policy grad
   mbdpg report RUN...        compare runs: tables with intervals; --out report.html for curves and more
   mbdpg benchmark            measure on this machine: updates, acting, starting, memory
 
-Every verb has its own --help; --debug shows tracebacks. mbdpg --version says which this is.
+Every verb has its own --help; --debug shows tracebacks. mbdpg --version says what this is.
 """
 
 
@@ -36,7 +36,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(OVERVIEW, end="")
         return
     if args[0] == "--version":
-        print(f"mbdpg {mbdpg.__version__}")
+        here = describe_machine()
+        print(
+            ", ".join(f"{name} {version}" for name, version in (here["versions"] | {"python": here["python"]}).items())
+        )
         return
     try:
         require(args[0] in VERBS, f"there is no verb {args[0]!r}; expected one of {', '.join(VERBS)}")
