@@ -16,8 +16,8 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
+from mbdpg.reports.curves import draw_seeds
 from mbdpg.reports.differences import commit
-from mbdpg.reports.record import mean_curve
 from mbdpg.reports.statistics import summarize
 from mbdpg.storage.files import replace_table
 from mbdpg.storage.metrics import read_metrics
@@ -118,11 +118,7 @@ def draw(name: str, env: str, curves: dict[str, Curves]) -> None:
     figure = Figure(figsize=(8, 4.6), layout="constrained")
     axes = figure.subplots()
     for number, (algorithm, seeds) in enumerate(curves.items()):
-        for curve in seeds.values():
-            axes.plot(list(curve), list(curve.values()), color=f"C{number}", alpha=0.35, linewidth=1)
-        mean = mean_curve(list(seeds.values()))
-        several = f"{len(seeds)} seed{'s' * (len(seeds) > 1)}"
-        axes.plot(list(mean), list(mean.values()), color=f"C{number}", linewidth=2, label=f"{algorithm} ({several})")
+        draw_seeds(axes, [*seeds.values()], label=algorithm, color=f"C{number}")
     others = defaultdict(list)
     with open(HERE / "published.csv", newline="") as file:
         for row in csv.DictReader(file):

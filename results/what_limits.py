@@ -81,6 +81,8 @@ def policy(options: argparse.Namespace) -> None:
             dreamed = float(dream(learner.state, jax.random.key(done)))
             says = f"return {np.mean(played.returns):7.0f}  per step {paid:6.3f}, in the model {dreamed:6.3f}"
             print(f"{done:6,} updates  {says}", flush=True)
+        if done == options.updates:
+            break
         learner.update(improving, [replay.sample(PER_CALL, improving.sampling, rng)], done)
         if grounding.updates_per_step:
             learner.update(grounding, [replay.sample(PER_CALL, grounding.sampling, rng)], done)
@@ -94,6 +96,8 @@ def model(options: argparse.Namespace) -> None:
     """Train dynamics on the first steps, test them on the later ones."""
     agent, env, replay, _ = load(options)
     env.close()
+    learned = f"--learned is {options.learned}, expected some of the run's {replay.size:,} steps, not all"
+    require(0 < options.learned < replay.size - max(DEPTHS), learned)
     rng, burn_in = np.random.default_rng(0), agent.config.burn_in
     rows, start = np.arange(replay.size), replay.columns()["start"]
     starts, episode = np.unique(start, return_inverse=True)
@@ -123,7 +127,8 @@ def model(options: argparse.Namespace) -> None:
 def load(options: argparse.Namespace) -> tuple[MBDPG, Environment, Replay, dict[str, np.ndarray]]:
     """The run's agent with other settings, its environment, its replay and the arrays of its newest checkpoint."""
     config, checkpoint = RunConfig.of(RunFolder.open(options.run)), load_checkpoint(options.run)
-    require(isinstance(config.agent, Config), f"{options.run} is of {config.algorithm}, expected mbdpg")
+    modelled = isinstance(config.agent, Config) and config.agent.horizon > 0
+    require(modelled, f"{options.run} is of {config.algorithm} without a model, expected mbdpg with a --horizon")
     env = config.make_env()
     agent = MBDPG(tyro.cli(Config, args=options.settings, default=cast(Config, config.agent)), env.spec)
     return agent, env, Replay.from_columns(checkpoint.replay), checkpoint.arrays

@@ -6,11 +6,12 @@ import io
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from matplotlib.figure import Figure
 
 from mbdpg.interfaces import UserError
-from mbdpg.reports.record import learning_curve, mean_curve
+from mbdpg.reports.record import Curve, learning_curve, mean_curve
 from mbdpg.storage.files import replace_durably
 
 
@@ -36,11 +37,7 @@ def draw_curves(groups: Mapping[str, Sequence[Path]], path: Path, *, title: str)
     for number, (label, curves) in enumerate(known.items()):
         if not curves:
             continue
-        for curve in curves:
-            axes.plot(list(curve), list(curve.values()), color=f"C{number}", alpha=0.35, linewidth=1)
-        mean = mean_curve(curves)
-        seeds = f"{len(curves)} seed{'s' * (len(curves) > 1)}"
-        axes.plot(list(mean), list(mean.values()), color=f"C{number}", linewidth=2, label=f"{label} ({seeds})")
+        draw_seeds(axes, curves, label=label, color=f"C{number}")
     axes.set(xlabel="environment steps", ylabel="evaluation return", title=title)
     axes.grid(alpha=0.3)
     axes.legend()
@@ -50,3 +47,11 @@ def draw_curves(groups: Mapping[str, Sequence[Path]], path: Path, *, title: str)
         replace_durably(path, picture.getvalue())  # and not what a link there points to
     except OSError as error:
         raise UserError(f"cannot write {path}: {error.strerror}") from error
+
+
+def draw_seeds(axes: Any, curves: Sequence[Curve], *, label: str, color: str) -> None:
+    """Draw each seed's curve thin and their mean bold, with how many there are in its label."""
+    for curve in curves:
+        axes.plot(list(curve), list(curve.values()), color=color, alpha=0.35, linewidth=1)
+    mean, seeds = mean_curve(curves), f"{len(curves)} seed{'s' * (len(curves) > 1)}"
+    axes.plot(list(mean), list(mean.values()), color=color, linewidth=2, label=f"{label} ({seeds})")
