@@ -21,7 +21,7 @@ import mbdpg
 from mbdpg.cli import VERBS, main
 from mbdpg.experiments import expert
 from mbdpg.experiments.pool import Local
-from mbdpg.storage import RunFolder
+from mbdpg.storage.run_folder import RunFolder
 
 Start = Callable[..., "subprocess.Popen[str]"]
 TINY = (

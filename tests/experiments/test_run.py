@@ -21,8 +21,8 @@ from mbdpg.agents import td3
 from mbdpg.experiments import origin, resuming, run
 from mbdpg.experiments.config import EnvOptions, RunConfig
 from mbdpg.interfaces import EnvSpec, Step, UserError
-from mbdpg.storage import RunFolder
 from mbdpg.storage.array_file import read_array_file
+from mbdpg.storage.run_folder import RunFolder
 from mbdpg.training.loop import Schedule
 
 Start = Callable[..., "subprocess.Popen[str]"]

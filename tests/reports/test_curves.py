@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 
 from mbdpg.interfaces import UserError
 from mbdpg.reports import curves
-from mbdpg.storage import MetricsLog
+from mbdpg.storage.metrics import MetricsLog
 
 
 def run_with(folder: Path, returns: dict[int, float], kind: str = "eval") -> Path:

@@ -19,7 +19,8 @@ import numpy as np
 import pytest
 
 from mbdpg.interfaces import UserError
-from mbdpg.storage import Checkpoint, CheckpointWriter, load_checkpoint, replay_chunks
+from mbdpg.storage import replay_chunks
+from mbdpg.storage.checkpoint import Checkpoint, CheckpointWriter, load_checkpoint
 from mbdpg.storage.replay_chunks import CHUNK_ROWS
 from mbdpg.storage.tensors import pack
 

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from mbdpg.interfaces import UserError
-from mbdpg.storage import CheckpointWriter, load_checkpoint
-from mbdpg.storage.checkpoint import MAX_JSON_BYTES
+from mbdpg.storage.checkpoint import MAX_JSON_BYTES, CheckpointWriter, load_checkpoint
 from mbdpg.storage.files import record_of
 from mbdpg.storage.tensors import pack
 

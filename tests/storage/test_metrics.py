@@ -13,8 +13,7 @@ import tensorboardX
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 
 from mbdpg.interfaces import UserError
-from mbdpg.storage import MetricsLog, read_metrics
-from mbdpg.storage.metrics import Value
+from mbdpg.storage.metrics import MetricsLog, Value, read_metrics
 
 FILES = ("metrics.jsonl", "timings.jsonl")
 

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from mbdpg.interfaces import UserError
-from mbdpg.storage import RunFolder, describe_machine, run_folder
+from mbdpg.storage import run_folder
+from mbdpg.storage.run_folder import RunFolder, describe_machine
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = {"seed": 3, "rate": 1 / 3, "limit": float("inf"), "sizes": [64, 64], "machine": {"cores": 2}, "é": None}
@@ -149,7 +150,7 @@ def test_a_run_with_links_in_it_is_refused(tmp_path: Path, part: str) -> None:
 
 HOLD_LOCK = """
 import pathlib, sys
-from mbdpg.storage import RunFolder
+from mbdpg.storage.run_folder import RunFolder
 with RunFolder.open(pathlib.Path(sys.argv[1])).locked():
     print("locked", flush=True)
     sys.stdin.read()
