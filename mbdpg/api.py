@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import SupportsIndex
 
 import numpy as np
 
@@ -26,7 +27,7 @@ def train(
     *,
     config: AgentConfig | None = None,
     schedule: Schedule | None = None,
-    seeds: Sequence[int] = (0,),
+    seeds: Iterable[SupportsIndex] = (0,),
     out: str | Path,
     demonstrations: str | Path | None = None,
     on_evaluation: Callable[[Update], None] | None = None,
@@ -50,7 +51,7 @@ def train(
     """
     made = isinstance(env, str) or callable(env)
     require(made, f"env is {type(env).__name__}, expected a Gymnasium id or a function that makes an environment")
-    require(not isinstance(seeds, int), f"seeds is {seeds}, expected a list of numbers, as in [{seeds}]")
+    require(isinstance(seeds, Iterable), f"seeds is {seeds}, expected a list of numbers, as in [{seeds}]")
     agent = agent_config("mbdpg", "default", env if isinstance(env, str) else None) if config is None else config
     kinds = tuple(CONFIGS.values())
     given = agent.__name__ if isinstance(agent, type) else type(agent).__name__

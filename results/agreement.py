@@ -39,7 +39,8 @@ def rows_of_peer(path: Path) -> list[dict[str, str]]:
 
 def rows_of_run(path: Path) -> list[dict[str, str]]:
     """The evaluations of a run folder in the same words."""
-    config, rows = RunFolder.open(path).config, read_metrics(path, "eval")
+    folder, rows = RunFolder.open(path), read_metrics(path, "eval")
+    config = folder.config
     first = {"program": "mbdpg", "env": config["env"], "algorithm": config["algorithm"], "seed": str(config["seed"])}
     seconds = np.asarray(rows["time/seconds"]) - np.asarray(rows["time/evaluating"])
     columns = (rows["env_steps"], rows["eval/return_mean"], rows["eval/return_std"], seconds)
@@ -49,7 +50,7 @@ def rows_of_run(path: Path) -> list[dict[str, str]]:
         | {"learning_seconds": str(round(spent))}
         for steps, mean, std, spent in zip(*columns, strict=True)
     ]
-    settings = RunConfig.from_json(config)
+    settings = RunConfig.of(folder)
     with contextlib.closing(settings.make_env()) as env:
         returns = evaluate(env, load_policy(path), EPISODES).returns
     paired = own[-1] | {

@@ -17,7 +17,6 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from mbdpg.reports.curves import draw_seeds
-from mbdpg.reports.differences import commit
 from mbdpg.reports.statistics import summarize
 from mbdpg.storage.files import replace_table
 from mbdpg.storage.metrics import read_metrics
@@ -63,7 +62,9 @@ def collect(name: str, runs: list[Path]) -> None:
             table = list(csv.DictReader(file))
     for run in runs:
         config = RunFolder.open(run).config
-        whose = {name: str(config[name]) for name in WHOSE[:3]} | {"commit": commit(config)}
+        commit = config["commit"] or ""
+        short = commit[:7] + commit[40:]  # a plus follows where files had changed
+        whose = {name: str(config[name]) for name in WHOSE[:3]} | {"commit": short}
         print(whose, config["machine"]["cpu"])
         table = [row for row in table if any(row[key] != whose[key] for key in WHOSE[:3])]
         columns = {name: values for name, values in read_metrics(run, "eval").items() if name in COLUMNS}

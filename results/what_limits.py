@@ -62,7 +62,7 @@ def policy(options: argparse.Namespace) -> None:
         learner.state = eqx.tree_at(actor_and_critics, learner.state, actor_and_critics(drawn_anew))
     phases = {phase.name: phase for phase in agent.phases}
     improving, grounding, fitting = phases["improving"], phases["grounding"], phases["fitting"]
-    recent = rng.integers(replay.size - RECENT, replay.size, 256)
+    recent = rng.integers(max(replay.size - RECENT, 0), replay.size, 256)
     starts = replay.windows(recent, improving.sampling)
     drawn = agent.config.planning == "stochastic"
 
@@ -81,7 +81,7 @@ def policy(options: argparse.Namespace) -> None:
             dreamed = float(dream(learner.state, jax.random.key(done)))
             says = f"return {np.mean(played.returns):7.0f}  per step {paid:6.3f}, in the model {dreamed:6.3f}"
             print(f"{done:6,} updates  {says}", flush=True)
-        if done == options.updates:
+        if done + PER_CALL > options.updates:
             break
         learner.update(improving, [replay.sample(PER_CALL, improving.sampling, rng)], done)
         if grounding.updates_per_step:
@@ -96,13 +96,13 @@ def model(options: argparse.Namespace) -> None:
     """Train dynamics on the first steps, test them on the later ones."""
     agent, env, replay, _ = load(options)
     env.close()
-    learned = f"--learned is {options.learned}, expected some of the run's {replay.size:,} steps, not all"
-    require(0 < options.learned < replay.size - max(DEPTHS), learned)
     rng, burn_in = np.random.default_rng(0), agent.config.burn_in
     rows, start = np.arange(replay.size), replay.columns()["start"]
     starts, episode = np.unique(start, return_inverse=True)
     ends = np.append(starts[1:], replay.size)[episode]
     later = np.flatnonzero((rows >= options.learned) & (rows + max(DEPTHS) <= ends))
+    most = f"--learned is {options.learned}, expected fewer than the run's {replay.size:,} steps"
+    require(options.learned > 0 and later.size > 0, f"{most}, by one of {max(DEPTHS)} steps that follow in an episode")
     tested = replay.windows(rng.choice(later, 1024), Sampling(1024, burn_in, max(DEPTHS)))
     learner = Learner(agent, [0])
     learner.prepare([replay.statistics(0.0)])
@@ -127,10 +127,11 @@ def model(options: argparse.Namespace) -> None:
 def load(options: argparse.Namespace) -> tuple[MBDPG, Environment, Replay, dict[str, np.ndarray]]:
     """The run's agent with other settings, its environment, its replay and the arrays of its newest checkpoint."""
     config, checkpoint = RunConfig.of(RunFolder.open(options.run)), load_checkpoint(options.run)
-    modelled = isinstance(config.agent, Config) and config.agent.horizon > 0
-    require(modelled, f"{options.run} is of {config.algorithm} without a model, expected mbdpg with a --horizon")
+    require(isinstance(config.agent, Config), f"{options.run} is of {config.algorithm}, expected mbdpg")
+    settings = tyro.cli(Config, args=options.settings, default=cast(Config, config.agent))
+    require(settings.horizon > 0, f"{options.run} has no model, expected one, or for `model` a --horizon")
     env = config.make_env()
-    agent = MBDPG(tyro.cli(Config, args=options.settings, default=cast(Config, config.agent)), env.spec)
+    agent = MBDPG(settings, env.spec)
     return agent, env, Replay.from_columns(checkpoint.replay), checkpoint.arrays
 
 

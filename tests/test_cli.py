@@ -116,10 +116,15 @@ def test_one_seed_that_goes_on_keeps_the_others_in_the_picture(say: Any, toys: N
     config.write_text(config.read_text().replace("Pendulum-v1", "Other-v1"))
     Path("run/damaged/config.json").write_text("{")
     whole = Path.cwd() / "run"
-    monkeypatch.chdir("run/seed-4")
-    said = say("resume", ".", "--steps", "60")
-    assert said.status == 0, said.err
-    assert drawn == [({"td3": [whole / "seed-0", whole / "seed-4"]}, whole / "learning-curve.png")]
+    said = say("resume", "run/seed-4", "--steps", "60")
+    assert said.status == 0 and "mbdpg: not drawn: run/damaged is not a run folder" in said.err
+    assert said.out.startswith("done: run, learning curve in run/learning-curve.png\nnext: mbdpg evaluate run/seed-4 ")
+    monkeypatch.chdir("run/seed-4/policy")
+    assert say("resume", "..", "--steps", "80").status == 0
+    seeds = [Path("seed-0"), Path("seed-4")]
+    assert drawn == [
+        ({"td3": [folder / seed for seed in seeds]}, folder / "learning-curve.png") for folder in (Path("run"), whole)
+    ]
 
 
 def test_without_out_a_run_gets_a_folder_named_after_what_it_is(say: Any, toys: None) -> None:
@@ -413,6 +418,14 @@ def test_a_study_that_is_stopped_says_how_to_go_on(say: Any, monkeypatch: pytest
     said = say("reproduce", "figure-8", "--scale", "smoke", "--seeds", "3")
     assert said == Said(143, "", "mbdpg: saved; go on with: mbdpg reproduce figure-8 --scale smoke --seeds 3\n")
     assert given == ["figure-8", "smoke", Path.cwd() / "studies" / "smoke", Local()]
+
+
+@pytest.mark.parametrize("seeds", [("1", "1"), ("0", "-1"), ()], ids=str)
+def test_wrong_seeds_are_refused_before_an_expert_is_trained_for_them(say: Any, seeds: Any) -> None:
+    """Only the first was looked at before it."""
+    flags = ("--demonstrations", "expert", "--out", "x")
+    check_refused(say("train", "LunarLanderContinuous-v3", *flags, "--seeds", *seeds), "--seeds are [")
+    assert list(Path.cwd().iterdir()) == []
 
 
 def test_an_expert_that_is_stopped_says_how_to_go_on_with_all_that_was_given(say: Any, monkeypatch: Any) -> None:

@@ -25,7 +25,7 @@ Learn continuous control from few samples: model-based deterministic policy grad
   mbdpg report RUN...        compare runs: tables with intervals; --out report.html for curves and more
   mbdpg benchmark            measure on this machine: updates, acting, starting, memory
 
-Every verb has its own --help; --debug shows tracebacks. mbdpg --version says what this is.
+Every verb has its own --help; --debug shows tracebacks. mbdpg --version prints the versions that matter.
 """
 
 
@@ -37,9 +37,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     if args[0] == "--version":
         here = describe_machine()
-        print(
-            ", ".join(f"{name} {version}" for name, version in (here["versions"] | {"python": here["python"]}).items())
-        )
+        versions = here["versions"] | {"python": here["python"]}
+        print(", ".join(f"{name} {version}" for name, version in versions.items() if version))
         return
     try:
         require(args[0] in VERBS, f"there is no verb {args[0]!r}; expected one of {', '.join(VERBS)}")

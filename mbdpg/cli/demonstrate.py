@@ -74,8 +74,10 @@ def make_demonstrations(flags: Demonstrate, args: Sequence[str], *, then: str = 
         with Stop() as stop:
             with RunDisplay(flags.steps) as display:
                 run = train(config, seeds=[flags.seed], out=folder, on_update=display, should_stop=stop)[0]
-            again = f"{program()} demonstrate {shlex.join(args)} --expert {run}"
-            stop.exit_if_asked(f"{program()} resume {run}, then {again}{then}")
+            again = shlex.join([*args, "--expert", str(run)])
+            stop.exit_if_asked(
+                f"{program()} resume {shlex.quote(str(run))}, then {program()} demonstrate {again}{then}"
+            )
     found = expert.record_from(
         run,
         flags.env,

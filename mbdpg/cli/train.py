@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections import defaultdict
+import os
+import shlex
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,9 +16,11 @@ from mbdpg.experiments import presets, run
 from mbdpg.experiments.compilations import keep_compilations
 from mbdpg.experiments.config import Algorithm, RunConfig
 from mbdpg.experiments.stopping import Stop
+from mbdpg.reports.comparison import grouped
 from mbdpg.reports.console import RunDisplay
 from mbdpg.reports.record import read_records
 from mbdpg.storage.run_folder import RunFolder
+from mbdpg.training.randomness import checked_seeds
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,7 @@ class RunOptions:
 def train(args: list[str]) -> None:
     """Run the verb."""
     flags = run_flags("train", "Learn a policy for a Gymnasium environment.", RunOptions, args)
+    checked_seeds(flags.run.seeds)  # before an expert is trained for them
     keep_compilations()
     config = RunConfig(flags.env, flags.agent, flags.schedule, flags.env_options)
     out = flags.run.out or default_folder("runs", config)
@@ -47,7 +52,7 @@ def train(args: list[str]) -> None:
         file = out / "demonstrations.safetensors"
         teacher = Demonstrate(flags.env, file, seed=flags.run.seeds[0], env_options=flags.env_options)
         again = [flags.env, "--out", str(file), "--seed", str(teacher.seed), *as_flags(flags.env_options)]
-        make_demonstrations(teacher, again, then=f", then this again with --demonstrations {file}")
+        make_demonstrations(teacher, again, then=f", then this again with --demonstrations {shlex.quote(str(file))}")
         config = dataclasses.replace(config, demonstrations=str(file))
     elif flags.run.demonstrations != "none":
         config = dataclasses.replace(config, demonstrations=flags.run.demonstrations)
@@ -59,15 +64,18 @@ def train(args: list[str]) -> None:
 
 
 def finish(runs: Sequence[Path]) -> None:
-    """Draw the learning curves of these runs and of all beside them on the same task; say what to do next."""
+    """Draw the learning curves of all runs that lie where these do, on the task of the first; say what to do next.
+
+    Means are over the steps at which all runs of the same settings were evaluated.
+    """
     from mbdpg.reports.curves import draw_curves  # not before: Matplotlib is a fifth of all modules' time
 
-    folder, env = runs[0].absolute().parent, RunFolder.open(runs[0]).config["env"]
+    first = runs[0]
+    folder = first.parent if first.name not in ("", "..") else Path(os.path.abspath(first)).parent
     beside = sorted(config.parent for config in folder.glob("*/config.json"))
-    groups: dict[str, list[Path]] = defaultdict(list)
-    for record in read_records(beside, leave_out=lambda why: None):
-        if record.config.get("env") == env:
-            groups[str(record.config.get("algorithm"))].append(record.folder)
+    records = read_records(beside, leave_out=lambda why: print(f"mbdpg: not drawn: {why}", file=sys.stderr))
+    env = RunFolder.open(first).config["env"]
+    groups = {label: [run.folder for run in own] for label, own in grouped(records).get(env, {}).items()}
     draw_curves(groups, folder / "learning-curve.png", title=env)
     print(f"done: {folder}, learning curve in {folder / 'learning-curve.png'}")
-    print(f"next: {program()} evaluate {runs[0]} --episodes 10 --video {folder / 'policy.mp4'}")
+    print(f"next: {program()} evaluate {first} --episodes 10 --video {folder / 'policy.mp4'}")

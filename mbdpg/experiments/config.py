@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -92,7 +93,7 @@ class RunConfig:
         try:
             return cls.from_json(run.config)
         except UserError as error:
-            raise UserError(f"{run.path} cannot be used, {error}; put its config.json back as it was") from error
+            raise UserError(f"{run.path} cannot be used: {error}") from error
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> RunConfig:
@@ -126,12 +127,13 @@ def _settings(kind: type[Any], data: Any, name: str) -> Any:
     require(isinstance(data, dict), f"config.json has no {name}")
     require(
         data.keys() == known.keys(),
-        f"config.json does not fit this version of mbdpg: {name} differs in {sorted(data.keys() ^ known.keys())[:5]}",
+        f"config.json does not fit this version of mbdpg, but that of its commit: {name} differs in "
+        f"{sorted(data.keys() ^ known.keys())[:5]}",
     )
     for key, default in known.items():
         value, number = data[key], (int, float)
         kinds = (*number, type(None)) if default is None else number if isinstance(default, float) else type(default)
         fits = isinstance(value, kinds) and (isinstance(default, bool) or not isinstance(value, bool))
         kind_of = "a number or null" if default is None else _KINDS.get(type(default), "text")
-        require(fits, f"config.json has {name}.{key} = {str(value)[:40]!r}, expected {kind_of}")
+        require(fits, f"config.json has {name}.{key} = {json.dumps(value)[:40]}, expected {kind_of}")
     return kind(**data)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsIndex
 
 from mbdpg.agents import mbdpg, mbpo, pets, sac, td3
 from mbdpg.dynamics.planning import PlanningPolicy, is_planner, planner_of
@@ -32,7 +32,7 @@ OnUpdate = Callable[[Update], None]
 def train(
     config: RunConfig,
     *,
-    seeds: Sequence[int],
+    seeds: Iterable[SupportsIndex],
     out: Path,
     make_env: MakeEnvironment | None = None,
     on_update: OnUpdate = lambda update: None,

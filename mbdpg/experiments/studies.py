@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 from mbdpg.agents import mbdpg
@@ -61,10 +62,10 @@ class Scale:
     success_share: float = 1.0
     """Least return of an expert's success, as a share of the return at which the task counts as solved."""
 
-    def shrunk(self, agent: AgentConfig, **settings: Any) -> Any:
-        """Settings of an agent, `tiny` where it has them and none is given."""
+    def shrunk(self, agent: AgentConfig, settings: Mapping[str, Any] = MappingProxyType({})) -> Any:
+        """The agent's config with those of `tiny` that it knows, and with `settings`, which go over them."""
         known = {field.name for field in dataclasses.fields(agent)}
-        return dataclasses.replace(agent, **({n: v for n, v in self.tiny.items() if n in known} | settings))
+        return dataclasses.replace(agent, **({n: v for n, v in self.tiny.items() if n in known} | dict(settings)))
 
 
 SCALES: dict[ScaleName, Scale] = {
@@ -167,7 +168,7 @@ def _cell(scale: Scale, env: str, label: str = "mbdpg", algorithm: str = "mbdpg"
     agent = agent_config(algorithm, preset, env)
     size = ANT_OBSERVATION if env.startswith("Ant") else None
     options = EnvOptions(max_episode_steps=PAPER_EPISODE_LIMIT, observation_size=size)
-    return Cell(label, RunConfig(env, scale.shrunk(agent, **settings), scale.schedule, options), demonstrated)
+    return Cell(label, RunConfig(env, scale.shrunk(agent, settings), scale.schedule, options), demonstrated)
 
 
 def _panels(tasks: Sequence[str], scale: Scale) -> tuple[Panel, ...]:
@@ -207,7 +208,7 @@ def _table_1(scale: Scale) -> Study:
 def _model(
     scale: Scale, label: str, aggregation: Aggregation = "none", *, env: str = RECORDED, **settings: Any
 ) -> Model:
-    agent = scale.shrunk(mbdpg.Config(), **(FAR | settings))
+    agent = scale.shrunk(mbdpg.Config(), FAR | settings)
     members = 1 if aggregation == "none" else mbdpg.Config().gaussians
     return Model(label, env, agent, aggregation, members)
 

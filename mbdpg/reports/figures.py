@@ -120,13 +120,12 @@ def _draw_curves(
 ) -> None:
     for number, (label, runs) in enumerate(groups.items()):
         shared = shared_steps(runs)
-        if not shared:
+        returns = [[run[step].return_mean for run in runs] for step in shared]
+        if not np.isfinite([own for step in returns for own in step]).any():
             continue
         added = max(one.expert_env_steps for run in runs for one in run.values()) if count_experts else 0
-        returns = ([run[step].return_mean for run in runs] for step in shared)
-        bands = [
-            band(own) if np.isfinite(own).all() else (np.nan,) * 3 for own in returns
-        ]  # a gap for all where one failed
+        # A gap for all of them where one failed.
+        bands = [band(own) if np.isfinite(own).all() else (np.nan,) * 3 for own in returns]
         middle, low, high = np.transpose(bands)
         steps = np.asarray(shared) + added
         axes.plot(steps, middle, color=f"C{number}", label=f"{label} ({_seeds(runs)})")

@@ -185,7 +185,7 @@ class Training:
         # At rate 0 nothing comes after the first updates, so calls of a size that leaves none of them over.
         chunk = max(1, round(rate * cycle)) if rate else math.gcd(phase.first_updates, cycle)
         first = math.ceil(phase.first_updates / chunk) * chunk
-        # Rounded first: 50 * 0.58 is a little less than 29, and would leave a call to the next cycle for ever.
+        # Rounded first: 50 * 0.58 is a little less than 29, and would leave a cycle's updates to the next one.
         due = first + int(round((self.env_steps - phase.after_steps) * rate, 6))
         while (done := self._updates[phase.name]) + chunk <= due and not should_stop():
             batches = [

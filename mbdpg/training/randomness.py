@@ -18,13 +18,13 @@ def checked_seeds(seeds: Iterable[Any]) -> list[int]:
     Raises:
         UserError: they are not whole numbers from 0 to 2^31 - 1, one or more and all different.
     """
-    given = list(seeds)
-    wrong = f"--seeds are {given}, expected whole numbers from 0 to 2^31 - 1, one or more and all different"
+    wanted = "expected whole numbers from 0 to 2^31 - 1, one or more and all different"
     try:
-        found = [operator.index(seed) for seed in given]
+        found = [operator.index(seed) for seed in seeds]
     except TypeError as error:
-        raise UserError(wrong) from error
-    require(0 < len(found) == len(set(found)) and all(0 <= seed < 2**31 for seed in found), wrong)
+        raise UserError(f"--seeds are {seeds}, {wanted}") from error
+    fit = 0 < len(found) == len(set(found)) and all(0 <= seed < 2**31 for seed in found)
+    require(fit, f"--seeds are {found}, {wanted}")
     return found
 
 

@@ -320,10 +320,13 @@ def test_a_longer_run_begins_where_the_shorter_ended(toy_run: Path, tmp_path: Pa
         ({"algorithm": "ppo"}, "config.json has algorithm 'ppo', expected mbdpg, td3, sac, pets, mbpo"),
         ({"env": None}, "does not say which environment"),
         ({"agent": None}, "config.json has no agent"),
-        ({"agent": {"width": 4}}, "config.json does not fit this version of mbdpg: agent differs in"),
+        (
+            {"agent": {"width": 4}},
+            "config.json does not fit this version of mbdpg, but that of its commit",
+        ),
         ({"seed": "0"}, "has seed '0' in its config.json"),
         ({"seed": -1}, "has seed -1"),
-        ({"agent": dataclasses.asdict(TOY.agent) | {"width": "4"}}, "config.json has agent.width = '4'"),
+        ({"agent": dataclasses.asdict(TOY.agent) | {"width": "4"}}, 'agent.width = "4", expected a whole number'),
         ({"agent": dataclasses.asdict(TOY.agent) | {"width": 0}}, "--width is 0, expected a number above 0"),
         (
             {"agent": dataclasses.asdict(TOY.agent) | {"width": 8}},
@@ -433,6 +436,12 @@ def test_seeds_that_are_none_are_refused(seeds: list[int], tmp_path: Path) -> No
     with pytest.raises(UserError, match="seeds are"):
         run.train(TOY, seeds=seeds, out=tmp_path / "run", make_env=Toy)
     assert not (tmp_path / "run").exists()
+
+
+def test_seeds_may_be_numpys(toys: None, tmp_path: Path) -> None:
+    """They ended in a TypeError of JSON's."""
+    (folder,) = run.train(TOY, seeds=np.arange(2, 3), out=tmp_path, make_env=Toy)
+    assert RunFolder.open(folder).config["seed"] == 2
 
 
 @pytest.mark.parametrize("ours", [True, False])

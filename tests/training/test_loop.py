@@ -189,15 +189,20 @@ def test_a_finished_run_that_is_resumed_adds_nothing(whole: Any, toy: Any) -> No
     assert bytes_of(recorder.checkpoints[-1][1]) == bytes_of(arrays)
 
 
-def counted(toy: Any, *phases: Phase, random_steps: int = 0, demonstrated: int = 0) -> list[dict[str, int]]:
-    """Updates taken by the end of each cycle of 5 steps."""
+def counted(
+    toy: Any, *phases: Phase, random_steps: int = 0, demonstrated: int = 0, cycle: int = 5
+) -> list[dict[str, int]]:
+    """Updates taken by the end of each of five cycles, the first of which the random steps may fill."""
     agent = toy.ToyAgent(toy.ToyEnv.spec, toy.ToyConfig(random_steps=random_steps))
     agent.phases = tuple(phase._replace(update=agent.update) for phase in phases)
     replay = Replay(2, 1)
     for _ in range(demonstrated):
         replay.add(np.zeros(2, np.float32), np.zeros(1, np.float32), 0.0, np.ones(2, np.float32), False, True)
     replay.demonstrated = demonstrated
-    schedule = Schedule(steps=20, cycle=5, evaluate_every=20, evaluation_episodes=1, log_every=5, checkpoint_every=5)
+    steps = 4 * cycle
+    schedule = Schedule(
+        steps, cycle, evaluate_every=steps, evaluation_episodes=1, log_every=cycle, checkpoint_every=cycle
+    )
     training, (recorder,) = toy.toy_training([0], agent=agent, schedule=schedule, replay=replay)
     run(training)
     return [checkpoint[2]["counts"] for checkpoint in recorder.checkpoints]
@@ -223,10 +228,9 @@ def test_a_rate_below_one_update_per_cycle_is_kept_on_average(counts: Any) -> No
 
 
 def test_a_rate_whose_product_is_just_below_a_whole_number_loses_no_cycle(counts: Any) -> None:
-    """5 * 0.58 * 10 is 28.999999999999996: the first cycle had none, and all others were one call behind."""
+    """50 * 0.58 is 28.999999999999996: the first two cycles had 0 and 29 updates, not 29 and 58."""
     assert 50 * 0.58 < 29
-    found = counts(Phase("rounded", 5.8, 0, DRAW), random_steps=0)
-    assert [count["rounded"] for count in found] == [0, 29, 58, 87, 116]
+    assert [count["rounded"] for count in counts(Phase("rounded", 0.58, 0, DRAW), cycle=50)] == [0, 29, 58, 87, 116]
 
 
 def test_first_updates_are_all_taken_though_they_are_not_a_multiple_of_anything(counts: Any) -> None:

@@ -13,8 +13,9 @@ from mbdpg.training.randomness import checked_seeds, noise_block
 
 def test_seeds_may_be_numpys_and_become_plain() -> None:
     """They ended in a TypeError of JSON's."""
-    found = checked_seeds(np.arange(3))
-    assert found == [0, 1, 2] and {type(seed) for seed in found} == {int}
+    for given in (np.arange(3), (i for i in range(3)), (np.int64(0), 1, 2)):
+        found = checked_seeds(given)
+        assert found == [0, 1, 2] and {type(seed) for seed in found} == {int}
 
 
 @pytest.mark.parametrize("seeds", [[0.5], ["0"], [None], [], [1, 1], [-1], [2**31]], ids=str)
