@@ -11,9 +11,11 @@ import pytest
 
 from mbdpg.agents.mbdpg import Config
 from mbdpg.experiments import model_study
+from mbdpg.experiments.config import RunConfig
 from mbdpg.experiments.model_study import ModelFit, Recorded
 from mbdpg.interfaces import UserError
 from mbdpg.storage.checkpoint import Checkpoint
+from mbdpg.storage.run_folder import RunFolder
 from mbdpg.training.replay import Replay
 
 LENGTHS = (5, 9, 5, 5, 12, 5, 5, 5, 5, 3)
@@ -70,10 +72,8 @@ def test_steps_that_a_run_was_resumed_for_are_not_among_those_of_a_study(recorde
 def test_a_fit_leaves_the_errors_of_its_model(
     recorded: Recorded, kind: Any, count: int, tmp_path: Path, monkeypatch: Any
 ) -> None:
-    config = type("Run", (), {"config": {}})
-    made = type("Made", (), {"make_env": lambda self: __import__("mbdpg.envs", fromlist=["make"]).make("Pendulum-v1")})
-    monkeypatch.setattr(model_study.RunFolder, "open", lambda path: config)
-    monkeypatch.setattr(model_study.RunConfig, "from_json", lambda data: made())
+    config = RunConfig("Pendulum-v1").to_json()
+    monkeypatch.setattr(model_study.RunFolder, "open", lambda path: RunFolder(path, config))
     out = tmp_path / "models" / "seed-0.csv"
     fit = ModelFit("m", SMALL, 3, Path("run"), sum(LENGTHS), 0, out, kind, count)
     with pytest.raises(UserError, match=f"run has saved {sum(LENGTHS)} of 100 steps to learn from; go on with it"):
