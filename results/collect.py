@@ -116,7 +116,7 @@ def tell(curves: dict[str, Curves]) -> None:
 
 def draw(name: str, env: str, curves: dict[str, Curves]) -> None:
     """Write NAME.png: our curves, and what others have published of theirs."""
-    figure = Figure(figsize=(8, 4.6), layout="constrained")
+    figure = Figure(figsize=(8, 6), layout="constrained")
     axes = figure.subplots()
     for number, (algorithm, seeds) in enumerate(curves.items()):
         draw_seeds(axes, [*seeds.values()], label=algorithm, color=f"C{number}")
@@ -131,7 +131,7 @@ def draw(name: str, env: str, curves: dict[str, Curves]) -> None:
         axes.plot(*zip(*points, strict=True), label=f"{method} ({version}, published)", **drawn)
     axes.set(xlabel="environment steps", ylabel="evaluation return", title=env)
     axes.grid(alpha=0.3)
-    axes.legend(fontsize="small")
+    figure.legend(loc="outside lower center", ncols=2, fontsize="small")  # where it hides no curve
     figure.savefig(HERE / f"{name}.png", dpi=110)
 
 
