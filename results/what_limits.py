@@ -1,12 +1,17 @@
 """What a run of MBDPG is limited by, asked of its newest checkpoint alone; nothing is written, no new step is taken.
 
     python results/what_limits.py policy RUN [--updates 4000] [--fresh] [--fits-per-update 1] [--planning deterministic]
+    python results/what_limits.py objective RUN
     python results/what_limits.py model RUN --learned 36000 [--updates 3000] [--fit-length 5 --burn-in 1]
 
 `policy` goes on learning from the replay as it is. If the real return rises, updates were missing; if what the policy
 earns in the model rises and the real return does not, it exploits the model's errors; if neither does, it is at an
 optimum of this model, and needs another model or new steps. With `--fresh` actor and critics begin anew, on the
 dynamics and steps that are there: if they come to more than the run's own, those had settled on what they saw first.
+`objective` takes apart what the actor climbs: the value of its first action, returns over so many imagined steps and a
+value after them, by the lesser of both critics and by their mean, and the penalty of saturated actions. What real
+episodes pay a small step back and on along each gradient tells which of them mislead: where learning has come to rest
+they add up to nothing, and those along which real returns fall hold the others back.
 `model` trains the dynamics afresh on the first steps and tests them on those that came later, which is what they are
 needed for: episodes of policies that they have not seen. Other settings of the agent's than the run's are `mbdpg
 train`'s flags.
@@ -17,14 +22,16 @@ from __future__ import annotations
 import argparse
 import time
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, cast, get_args
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import tyro
 
+from mbdpg.agents import objectives
 from mbdpg.agents.mbdpg import MBDPG, Config
 from mbdpg.dynamics.accuracy import DEPTHS
 from mbdpg.dynamics.fitting import open_loop_error
@@ -32,6 +39,7 @@ from mbdpg.dynamics.imagination import imagine
 from mbdpg.experiments.compilations import keep_compilations
 from mbdpg.experiments.config import RunConfig
 from mbdpg.interfaces import Environment, Sampling, require
+from mbdpg.networks.policy import NumpyPolicy, policy_arrays
 from mbdpg.storage.checkpoint import load_checkpoint
 from mbdpg.storage.run_folder import RunFolder
 from mbdpg.training.evaluation import evaluate
@@ -42,6 +50,10 @@ PER_CALL = 50
 SAY_EVERY = 1000
 RECENT = 6000
 """Newest steps that imagination starts from."""
+BATCHES = 64
+"""From which the mean gradients of the actor's objective are taken."""
+STEP = 1e-4
+"""Along such a gradient: root mean square change of a parameter."""
 DREAM = 200
 """Imagined steps; rewards of the second half are compared with what an episode pays per step."""
 
@@ -92,6 +104,50 @@ def policy(options: argparse.Namespace) -> None:
     env.close()
 
 
+def objective(options: argparse.Namespace) -> None:
+    """Follow each part of the actor's objective a little in the real environment."""
+    agent, env, replay, arrays = load(options)
+    config, learner, rng = agent.config, Learner(agent, [options.seed]), np.random.default_rng(options.seed)
+    learner.restore([arrays])
+    state = jax.tree.map(lambda leaf: leaf[0], learner.state)
+    sampling = next(phase for phase in agent.phases if phase.name == "improving").sampling
+    batches = [jax.tree.map(lambda x: x[0], replay.sample(1, sampling, rng)) for _ in range(BATCHES)]
+    keys = list(jax.random.split(jax.random.key(options.seed), BATCHES))
+
+    def parts(actor: Any, batch: Any, key: Any) -> dict[str, Any]:
+        """Means over a batch."""
+        start = agent._start(state, state.window(batch), key=key)
+        drawn = key if config.planning == "stochastic" else None
+        imagined = imagine(state.average_dynamics, state.scales, actor, *start[:2], horizon=config.horizon, key=drawn)
+        alive = config.discount ** jnp.arange(config.horizon + 1)[:, None] * imagined.survival() * start.weight
+        paid = jnp.cumsum(alive[:-1] * imagined.rewards, axis=0)
+        paid = jnp.concatenate([jnp.zeros_like(paid[:1]), paid])
+        values = state.critics(imagined.observations, imagined.actions)
+        found = {"less saturation": -jnp.mean(jnp.square(actor.mlp(start.observation)))}
+        for kind in get_args(objectives.ActorValue):
+            returns = jnp.mean(paid + alive * objectives.climbed_value(values, kind), axis=1)
+            found |= {f"{steps} steps, {kind}": returns[steps] for steps in range(config.horizon + 1)}
+            found[f"all of them, {kind}"] = jnp.mean(returns)
+        return found
+
+    slopes = jax.jit(jax.jacrev(parts))
+    actor, drawn = state.average_actor, zip(batches, keys, strict=True)
+    summed = [slopes(actor, batch, key) for batch, key in drawn]
+    gradients = jax.tree.map(lambda *leaves: sum(leaves), *summed)
+
+    def played(direction: Any, step: float) -> float:
+        moved = jax.tree.map(lambda leaf, d: leaf + step * d, actor, direction)
+        policy = NumpyPolicy(policy_arrays(moved, state.normalizer))
+        return float(np.mean(evaluate(env, policy, range(1000, 1005)).returns))
+
+    entries = sum(leaf.size for leaf in jax.tree.leaves(actor))
+    print(f"return {played(actor, 0.0):.0f}; a root mean square step of {STEP:g} back and on along the gradient of")
+    for name, direction in gradients.items():
+        step = STEP * entries**0.5 / float(optax.tree.norm(direction))
+        print(f"{name:22} {played(direction, -step):7.0f} {played(direction, step):7.0f}", flush=True)
+    env.close()
+
+
 def model(options: argparse.Namespace) -> None:
     """Train dynamics on the first steps, test them on the later ones."""
     agent, env, replay, _ = load(options)
@@ -137,7 +193,7 @@ def load(options: argparse.Namespace) -> tuple[MBDPG, Environment, Replay, dict[
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("question", choices=("policy", "model"))
+    parser.add_argument("question", choices=("policy", "objective", "model"))
     parser.add_argument("run", type=Path)
     parser.add_argument("--updates", type=int, default=3000)
     parser.add_argument("--fresh", action="store_true", help="actor and critics begin anew")
@@ -147,4 +203,4 @@ if __name__ == "__main__":
     keep_compilations()
     asked, settings = parser.parse_known_args()
     asked.settings = settings
-    {"policy": policy, "model": model}[asked.question](asked)
+    {"policy": policy, "objective": objective, "model": model}[asked.question](asked)
