@@ -86,17 +86,17 @@ def policy_objective(
 
     Args:
         rewards: imagined, H of them.
-        values: Q along the trajectory: H of them from t = 1 as printed, or H + 1 from t = 0.
+        values: Q along the trajectory to t = H: H of them from t = 1 as printed, or more or fewer from another t.
         survival: probability of being alive at each of the H + 1 states.
         discount: gamma.
         beta: weight of the imagined rewards.
-        reward_weights: "uniform" as printed; "remaining" weighs reward t by the H - t value terms that follow it.
+        reward_weights: "uniform" as printed; "remaining" weighs a reward by the number of value terms that follow it.
             Only then is J, with beta = 1, the sum of all n-step returns, in which every reward counts alike whether
             it falls before or behind a value term.
     """
     horizon = rewards.shape[0]
     powers = discount ** jnp.arange(horizon + 1, dtype=rewards.dtype)[:, None] * survival
-    remaining = horizon - jnp.arange(horizon, dtype=rewards.dtype)
+    remaining = jnp.minimum(horizon - jnp.arange(horizon, dtype=rewards.dtype), values.shape[0])
     weights = beta * (remaining if reward_weights == "remaining" else jnp.ones_like(remaining))
     total = jnp.sum(weights[:, None] * powers[:-1] * rewards, axis=0)
     total += jnp.sum(powers[horizon + 1 - values.shape[0] :] * values, axis=0)

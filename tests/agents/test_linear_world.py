@@ -183,7 +183,7 @@ def test_without_rewards_the_eq19_gradient_is_that_of_ordinary_dpg() -> None:
     np.testing.assert_allclose(flat(gradient), flat(expected), rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize(("first_value", "reward_weights"), [(1, "uniform"), (0, "remaining")])
+@pytest.mark.parametrize(("first_value", "reward_weights"), [(1, "uniform"), (0, "remaining"), (3, "remaining")])
 def test_the_full_gradient_is_that_of_finite_differences(first_value: int, reward_weights: str) -> None:
     """In float64, in the linear world's bends: tanh of the policy, the minimum of the critics, survival."""
     settings = {"horizon": 3, "first_value": first_value, "reward_weights": reward_weights}

@@ -118,13 +118,13 @@ def policy_objective(rewards, values, survival, *, beta: float, reward_weights: 
 
 
 @pytest.mark.parametrize("reward_weights", ["uniform", "remaining"])
-@pytest.mark.parametrize("first_value", [0, 1])
+@pytest.mark.parametrize("first_value", [0, 1, H])
 def test_the_policy_objective_is_eq_18(reward_weights: str, first_value: int) -> None:
     rewards, values = draw(H, BATCH), draw(H + 1 - first_value, BATCH, seed=1)
     survival = np.cumprod(np.random.default_rng(2).uniform(0.5, 1, (H + 1, BATCH)), axis=0)
     total = np.zeros(BATCH)
     for t in range(H):
-        weight = 0.7 * (H - t if reward_weights == "remaining" else 1)
+        weight = 0.7 * (min(H - t, len(values)) if reward_weights == "remaining" else 1)
         total += weight * GAMMA**t * survival[t] * rewards[t]
     for t in range(first_value, H + 1):
         total += GAMMA**t * survival[t] * values[t - first_value]
@@ -133,7 +133,7 @@ def test_the_policy_objective_is_eq_18(reward_weights: str, first_value: int) ->
 
 
 @pytest.mark.parametrize("beta", [1.0, 3.0])
-@pytest.mark.parametrize("first_value", [0, 1])
+@pytest.mark.parametrize("first_value", [0, 1, 2, H])
 @pytest.mark.parametrize("reward_weights", ["uniform", "remaining"])
 def test_total_weight_of_each_reward_where_values_are_exact(beta: float, first_value: int, reward_weights: str) -> None:
     """methods.md 2.8: how often gamma^k r_{k+1} is counted, directly or inside a value, times the value terms."""
@@ -146,8 +146,8 @@ def test_total_weight_of_each_reward_where_values_are_exact(beta: float, first_v
             rewards[:H], np.stack(values), np.ones((H + 1, 1)), beta=beta, reward_weights=reward_weights
         )
         weight = objective[0] * len(values) / GAMMA**k
-        direct = (H - k if reward_weights == "remaining" else 1) if k < H else 0
-        assert weight == pytest.approx(beta * direct + min(k + 1, H + 1) - first_value * (k >= 0), rel=1e-5)
+        direct = (min(H - k, len(values)) if reward_weights == "remaining" else 1) if k < H else 0
+        assert weight == pytest.approx(beta * direct + max(min(k, H) + 1 - first_value, 0), rel=1e-5)
         if reward_weights == "uniform" and first_value == 1:  # as printed
             assert weight == pytest.approx(beta + k if k < H else H, rel=1e-5)
         if reward_weights == "remaining" and beta == 1.0:  # every reward alike

@@ -20,6 +20,7 @@ IMPOSSIBLE = [
     *((model_based.Config, name, value) for name, value in SHARES),
     *((config, name, value) for config in (td3.Config, sac.Config, mbpo.Config) for name, value in SHARES),
     (model_based.Config, "horizon", -1),
+    (model_based.Config, "first_value", 6),
     (model_based.Config, "batch_size", -1),
     (model_based.Config, "trace", -0.1),
     (model_based.Config, "average_share", 1.5),

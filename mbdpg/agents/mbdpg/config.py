@@ -42,8 +42,9 @@ class Config:
     """Weight beta once returns reach the reference return; in between it follows the return."""
     reward_weights: RewardWeights = "remaining"
     """Reward t weighs beta times: the value terms after it ("remaining"), or one ("uniform", as printed)."""
-    first_value: Literal[0, 1] = 0
-    """Imagined step at which the value terms of Eq. 18 begin: 1 as printed, 0 to teach the first action by Q too."""
+    first_value: int = 0
+    """Imagined step at which the value terms of Eq. 18 begin: 1 as printed, 0 to teach the first action by Q too, H for
+    the H-step return alone."""
     terminal_value: bool = True
     """Whether the actor climbs values (Eq. 18) or, as in Fig. 9c, the imagined rewards alone."""
     actor_value: ActorValue = "clipped"
@@ -124,8 +125,8 @@ class Config:
             },
         )
         require(
-            self.first_value == 0 or self.horizon > 0,
-            f"--first-value is {self.first_value}, expected 0 where --horizon is 0: there is no later value",
+            0 <= self.first_value <= self.horizon,
+            f"--first-value is {self.first_value}, expected 0 to the {self.horizon} imagined steps of --horizon",
         )
         climbs = self.terminal_value or (self.horizon > 0 and min(self.beta, self.final_beta) > 0)
         nothing = "without --terminal-value there is nothing to climb where --horizon, --beta or --final-beta is 0"
