@@ -119,15 +119,24 @@ def objective(options: argparse.Namespace) -> None:
         start = agent._start(state, state.window(batch), key=key)
         drawn = key if config.planning == "stochastic" else None
         imagined = imagine(state.average_dynamics, state.scales, actor, *start[:2], horizon=config.horizon, key=drawn)
-        alive = config.discount ** jnp.arange(config.horizon + 1)[:, None] * imagined.survival() * start.weight
-        paid = jnp.cumsum(alive[:-1] * imagined.rewards, axis=0)
-        paid = jnp.concatenate([jnp.zeros_like(paid[:1]), paid])
-        values = state.critics(imagined.observations, imagined.actions)
+        values, survival = state.critics(imagined.observations, imagined.actions), imagined.survival()
+
+        def climbed(kind: objectives.ActorValue, first: int, last: int) -> Any:
+            """Mean return over `first` to `last` imagined steps, and a value after them."""
+            returns = objectives.policy_objective(
+                imagined.rewards[:last],
+                objectives.climbed_value(values, kind)[first : last + 1],
+                survival[: last + 1],
+                discount=config.discount,
+                beta=jnp.ones(()),
+                reward_weights="remaining",
+            )
+            return jnp.mean(returns * start.weight)
+
         found = {"less saturation": -jnp.mean(jnp.square(actor.mlp(start.observation)))}
         for kind in get_args(objectives.ActorValue):
-            returns = jnp.mean(paid + alive * objectives.climbed_value(values, kind), axis=1)
-            found |= {f"{steps} steps, {kind}": returns[steps] for steps in range(config.horizon + 1)}
-            found[f"all of them, {kind}"] = jnp.mean(returns)
+            found |= {f"{k} steps, {kind}": climbed(kind, k, k) for k in range(config.horizon + 1)}
+            found[f"all of them, {kind}"] = climbed(kind, 0, config.horizon)
         return found
 
     slopes = jax.jit(jax.jacrev(parts))
