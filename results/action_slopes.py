@@ -24,7 +24,6 @@ from mbdpg.agents import objectives
 from mbdpg.dynamics.imagination import imagine
 from mbdpg.experiments.compilations import keep_compilations
 from mbdpg.interfaces import require
-from mbdpg.networks.policy import NumpyPolicy, policy_arrays
 from mbdpg.training.learner import Learner
 
 HORIZONS = 1, 2, 5, 10, 20
@@ -43,12 +42,12 @@ def main(options: argparse.Namespace) -> None:
     learner, rng = Learner(agent, [options.seed]), np.random.default_rng(options.seed)
     learner.restore([arrays])
     state, discount = jax.tree.map(lambda leaf: leaf[0], learner.state), agent.config.discount
-    policy, wrapped = NumpyPolicy(policy_arrays(state.average_actor, state.normalizer)), env
-    simulator: Any = wrapped._env.unwrapped  # type: ignore[attr-defined]
+    policy = learner.policies()[0]
+    simulator: Any = env._env.unwrapped  # type: ignore[attr-defined]
     require(hasattr(simulator, "set_state"), f"{env.spec.id} cannot be put in a state, expected a task of MuJoCo's")
 
     def step(action: np.ndarray) -> tuple[np.ndarray, float, bool]:
-        observation, reward, ended, *_ = simulator.step(wrapped._real_action(action))  # type: ignore[attr-defined]
+        observation, reward, ended, *_ = simulator.step(env._real_action(action))  # type: ignore[attr-defined]
         return observation, float(reward), bool(ended)
 
     simulator.reset(seed=options.seed)
