@@ -168,6 +168,8 @@ class Sampling(NamedTuple):
     """Draw from demonstrations alone."""
     part: Part = "all"
     """Where the drawn steps are."""
+    newest: int = 0
+    """Draw from so many of the newest steps alone; 0: from all."""
 
 
 class Statistics(NamedTuple):

@@ -127,7 +127,8 @@ class Replay:
         rows = self.demonstrated if sampling.demonstrated else self.size
         held_out = rows // HELD_OUT
         count = {"all": rows, "kept": rows - held_out, "held-out": max(held_out, 1)}[sampling.part]
-        drawn = rng.integers(0, count, (updates, sampling.batch_size))
+        oldest = max(rows - sampling.newest, 0) if sampling.newest else 0
+        drawn = rng.integers(oldest, count, (updates, sampling.batch_size))
         if sampling.part == "kept":
             drawn += drawn // (HELD_OUT - 1)
         elif sampling.part == "held-out":

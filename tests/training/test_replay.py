@@ -268,6 +268,15 @@ def test_demonstrations_alone_are_drawn_where_the_sampling_says_so() -> None:
     assert every.observation[..., 0, 0].max() > 4
 
 
+def test_the_newest_steps_alone_are_drawn_where_the_sampling_says_so() -> None:
+    newest = {row.observation[0] for row in rows_of()[-3:]}
+    for most, expected in ((3, newest), (10_000, {row.observation[0] for row in rows_of()})):
+        drawn = filled().sample(40, Sampling(10, 0, 1, newest=most), np.random.default_rng(0))
+        assert set(drawn.observation[..., 0, 0].ravel()) == expected
+    window = filled().sample(40, Sampling(10, 2, 1, newest=3), np.random.default_rng(0))
+    assert window.observation[..., 0, 0].min() < min(newest)  # what came before is still remembered
+
+
 def test_kept_and_held_out_steps_are_apart_and_together_all() -> None:
     replay = Replay(1, 1)
     for row in range(23):

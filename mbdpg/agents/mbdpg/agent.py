@@ -35,8 +35,8 @@ class MBDPG:
         c = config
         fitted = Sampling(c.fit_batch_size, c.burn_in, c.fit_length)
         cloned = Sampling(c.batch_size, burn_in=0, length=1, demonstrated=True)
-        improved = Sampling(c.batch_size, c.burn_in, length=1)
-        grounded = Sampling(c.grounding_batch_size, burn_in=0, length=c.grounding_length)
+        improved = Sampling(c.batch_size, c.burn_in, length=1, newest=c.recent_steps)
+        grounded = Sampling(c.grounding_batch_size, 0, c.grounding_length, newest=c.recent_steps)
         fitting = Phase("fitting", c.fits_per_step, c.random_steps, fitted, c.pretraining_fits, self.fit)
         self.phases = (
             Phase("cloning", 0.0, c.random_steps, cloned, c.cloning_updates, self.clone),
