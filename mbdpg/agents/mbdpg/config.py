@@ -82,7 +82,7 @@ class Config:
     grounding_tolerance: float = 0.3
     """A return goes on by e^(-d^2 / 2) past an action that is d times this, in root mean square, off the policy's."""
     recent_steps: int = 0
-    """Newest environment steps that actor and critics learn from, the dynamics from all; 0 is all for them too."""
+    """Newest environment steps that actor and critics learn from, the dynamics from all; 0: they from all too."""
     random_steps: int = 4000
     """Environment steps with uniformly random actions before learning starts."""
     fit_length: int = 5
