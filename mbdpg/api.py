@@ -11,7 +11,7 @@ import numpy as np
 from mbdpg import envs
 from mbdpg.dynamics.planning import PlanningPolicy
 from mbdpg.experiments import resuming, run
-from mbdpg.experiments.config import CONFIGS, AgentConfig, RunConfig
+from mbdpg.experiments.config import CONFIGS, AgentConfig, EnvOptions, RunConfig
 from mbdpg.experiments.presets import agent_config
 from mbdpg.interfaces import Environment, require
 from mbdpg.networks.policy import NumpyPolicy
@@ -30,17 +30,20 @@ def train(
     seeds: Iterable[SupportsIndex] = (0,),
     out: str | Path,
     demonstrations: str | Path | None = None,
+    reference_return: float | None = None,
     on_evaluation: Callable[[Update], None] | None = None,
 ) -> list[Path]:
     """Train an agent; its config's type says which.
 
     Args:
         env: a Gymnasium id, or a function that makes an environment (called a few times).
-        config: the agent's settings; by default MBDPG's, as `mbdpg train` has them for this task.
+        config: the agent's settings; by default `agent_config(env=env)`, those that `mbdpg train` has for this task.
         schedule: length of the run, and how often it evaluates and saves.
         seeds: one run each, all in this process.
         out: a folder that gets one run folder `seed-<seed>` per seed.
         demonstrations: a file that `mbdpg demonstrate` wrote.
+        reference_return: undiscounted return at which the task is solved; exploration noise falls on the way there.
+            By default what Gymnasium or we know of an id; where nothing is known, noise stays as it is.
         on_evaluation: called after every evaluation.
 
     Returns:
@@ -52,7 +55,7 @@ def train(
     made = isinstance(env, str) or callable(env)
     require(made, f"env is {type(env).__name__}, expected a Gymnasium id or a function that makes an environment")
     require(isinstance(seeds, Iterable), f"seeds is {seeds}, expected a list of numbers, as in [{seeds}]")
-    agent = agent_config("mbdpg", "default", env if isinstance(env, str) else None) if config is None else config
+    agent = agent_config(env=env if isinstance(env, str) else None) if config is None else config
     kinds = tuple(CONFIGS.values())
     given = agent.__name__ if isinstance(agent, type) else type(agent).__name__
     require(
@@ -62,6 +65,7 @@ def train(
         env=env if isinstance(env, str) else _name(env) or "environment made in code",
         agent=agent,
         schedule=schedule or Schedule(),
+        env_options=EnvOptions(reference_return=reference_return),
         demonstrations=None if demonstrations is None else str(demonstrations),
     )
     return run.train(

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import mbdpg
+from mbdpg.training.collector import Collector
 
 
 class Slider(gymnasium.Env[Any, Any]):
@@ -113,6 +114,24 @@ def test_a_policy_may_be_any_function_and_what_it_raises_comes_through() -> None
     np.testing.assert_array_equal(found.steps.columns()["action"], -np.sign(found.steps.columns()["observation"]))
     with pytest.raises(ZeroDivisionError):
         mbdpg.evaluate(slider, lambda observation: observation / (1 // 0))
+
+
+def test_exploration_follows_the_reference_return_that_one_s_own_environment_is_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[float | None] = []
+
+    def progress(collector: Collector, reference: float | None) -> float:
+        seen.append(reference)
+        return 0.0
+
+    monkeypatch.setattr(Collector, "progress", progress)
+    for reference in None, -3.5:
+        seen.clear()
+        out = tmp_path / str(reference)
+        (folder,) = mbdpg.train(slider, config=CONFIG, schedule=SCHEDULE, out=out, reference_return=reference)
+        mbdpg.resume(folder, env=slider, steps=60)
+        assert len(seen) >= 4 and set(seen) == {reference}
 
 
 def test_a_function_that_makes_the_environment_will_do(tmp_path: Path) -> None:

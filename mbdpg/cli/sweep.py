@@ -27,7 +27,7 @@ class SweepOptions:
     algorithm: Algorithm = "mbdpg"
     """Algorithm to train."""
     preset: presets.Preset = "default"
-    """Settings that measured best, or those published; other flags change single ones."""
+    """Settings that measured best here, or those published; any other flag changes a single one."""
     search: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUES...")] = ()
     """Settings and their values: horizon=1:20, critic-learning-rate=1e-5:1e-3:log, gradient=full,eq19."""
     trials: int = 20

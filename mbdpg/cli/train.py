@@ -30,7 +30,7 @@ class RunOptions:
     algorithm: Algorithm = "mbdpg"
     """Algorithm to train."""
     preset: presets.Preset = "default"
-    """Settings that measured best, or those published; other flags change single ones."""
+    """Settings that measured best here, or those published; any other flag changes a single one."""
     seeds: tuple[int, ...] = (0,)
     """Random seeds; each is a run of its own, all in this process."""
     out: Path | None = None

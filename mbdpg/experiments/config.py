@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from mbdpg import envs
 from mbdpg.agents import mbdpg, mbpo, pets, sac, td3
-from mbdpg.interfaces import UserError, require
+from mbdpg.interfaces import EnvSpec, UserError, require
 from mbdpg.storage.run_folder import RunFolder
 from mbdpg.training.loop import Schedule
 
@@ -46,6 +46,11 @@ class EnvOptions:
         given = self.reference_return
         require(given is None or math.isfinite(given), f"--reference-return is {given}, expected a finite number")
 
+    def override(self, spec: EnvSpec) -> EnvSpec:
+        """What an environment, one made in code too, tells of itself, with the reference return that is given."""
+        given = self.reference_return
+        return spec if given is None else dataclasses.replace(spec, reference_return=given)
+
 
 @dataclass(frozen=True)
 class RunConfig:
@@ -79,8 +84,7 @@ class RunConfig:
             observation_size=options.observation_size,
             allow_import=options.allow_import,
         )
-        if options.reference_return is not None:
-            env.spec = dataclasses.replace(env.spec, reference_return=options.reference_return)
+        env.spec = options.override(env.spec)
         return env
 
     @classmethod

@@ -110,8 +110,17 @@ PAPER_EPISODE_LIMIT = 1000
 """Section 5.1 cuts every episode, in training and test, at 1,000 steps."""
 
 
-def agent_config(algorithm: str, preset: str, env: str | None = None) -> AgentConfig:
-    """The algorithm's settings under a preset, which has values of their own for some tasks."""
+def agent_config(algorithm: str = "mbdpg", preset: str = "default", env: str | None = None) -> AgentConfig:
+    """An algorithm's settings under a preset, which has values of their own for some tasks.
+
+    Args:
+        algorithm: mbdpg, td3, sac, pets or mbpo.
+        preset: "default", what measured best, or "paper", what is published.
+        env: a Gymnasium id, whose version does not matter.
+
+    Raises:
+        UserError: no such algorithm or preset.
+    """
     require(algorithm in CONFIGS, f"unknown --algorithm {algorithm!r}; expected one of {', '.join(CONFIGS)}")
     require(preset in get_args(Preset), f"unknown --preset {preset!r}; expected {' or '.join(get_args(Preset))}")
     own = TASKS[preset].get(algorithm, {}).get(env.rpartition("-v")[0], {}) if env else {}

@@ -101,7 +101,7 @@ def _go_on(
 ) -> None:
     """Train on, all in this process."""
     paths, config, checkpoints = [s.folder.path for s in group], group[0].config, [s.checkpoint for s in group]
-    spec = spec_of(make)
+    spec = spec_of(make, config.env_options)
     with contextlib.ExitStack() as stack:
         recorders, seeds = [], []
         for s in group:

@@ -10,7 +10,7 @@ from typing import Any, SupportsIndex
 
 from mbdpg.agents import mbdpg, mbpo, pets, sac, td3
 from mbdpg.dynamics.planning import PlanningPolicy, is_planner, planner_of
-from mbdpg.experiments.config import RunConfig
+from mbdpg.experiments.config import EnvOptions, RunConfig
 from mbdpg.experiments.origin import origin
 from mbdpg.experiments.recorder import Recorder
 from mbdpg.imitation.demonstrations import Demonstrations
@@ -56,7 +56,7 @@ def train(
     """
     seeds = checked_seeds(seeds)
     make = make_env or config.make_env
-    spec = spec_of(make)
+    spec = spec_of(make, config.env_options)
     demonstrations = Demonstrations.load(Path(config.demonstrations), spec) if config.demonstrations else None
     description = config.to_json() | origin(len(seeds))
     folders: list[RunFolder] = []
@@ -169,11 +169,11 @@ def compose(
     return training
 
 
-def spec_of(make: MakeEnvironment) -> EnvSpec:
+def spec_of(make: MakeEnvironment, options: EnvOptions) -> EnvSpec:
     """What an environment tells agents, asked of one that is closed again; it must end some time."""
     env = make()
     env.close()
-    spec = env.spec
+    spec = options.override(env.spec)
     require(
         spec.episode_limit is not None,
         f"{spec.id} has no step limit, so an episode could go on for ever; set --max-episode-steps, or in code wrap it "

@@ -37,7 +37,7 @@ class Config:
     saturation_penalty: float = 1e-3
     """Weight of the mean square of the policy's output before its tanh."""
     beta: float = 1.0
-    """Weight beta of imagined rewards in Eq. 18 while returns are a random policy's."""
+    """Weight beta of imagined rewards in Eq. 18 at first, while returns are those of a random policy."""
     final_beta: float = 1.0
     """Weight beta once returns reach the reference return; in between it follows the return."""
     reward_weights: RewardWeights = "remaining"
@@ -48,7 +48,7 @@ class Config:
     terminal_value: bool = True
     """Whether the actor climbs values (Eq. 18) or, as in Fig. 9c, the imagined rewards alone."""
     actor_value: ActorValue = "clipped"
-    """What the actor climbs: the lesser of both critics' values (Eq. 17), or their mean, which fears less."""
+    """What the actor climbs: the lesser of both critics' values (Eq. 17), or their mean, which is less pessimistic."""
     trace: float = 0.5
     """Lambda of the value expansion: 1 is Eq. 16, 0 one-step targets, in between longer expansions count less."""
     imagined_weight: float = 0.5
@@ -62,7 +62,7 @@ class Config:
     target_update_every: int = 1
     """Updates of the critics, those on real returns too, between two of the targets, the paper's C."""
     average_share: float = 0.05
-    """Averages imagine and are evaluated, of dynamics and actor, with weights that fade over this share of updates."""
+    """Imagination uses an average of the dynamics, evaluation one of the actor, both fading over this share of updates."""
     target_noise: float = 0.2
     """Standard deviation of the noise on target actions."""
     exploration_std: float = 0.3
@@ -78,11 +78,11 @@ class Config:
     grounding_length: int = 8
     """Consecutive real steps over which each takes returns."""
     grounding_batch_size: int = 32
-    """Windows of so many steps in each."""
+    """Windows of --grounding-length steps in each of these updates."""
     grounding_tolerance: float = 0.3
-    """A return goes on by e^(-d^2 / 2) past an action that is d times this, in root mean square, off the policy's."""
+    """A return goes on with weight e^(-d^2 / 2) past an action d times this (root mean square) from the policy's."""
     recent_steps: int = 0
-    """Newest environment steps that actor and critics learn from, the dynamics from all; 0: they from all too."""
+    """Actor and critics learn from so many of the newest environment steps, the dynamics from all; 0: all from all."""
     random_steps: int = 4000
     """Environment steps with uniformly random actions before learning starts."""
     fit_length: int = 5
