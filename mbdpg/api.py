@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import SupportsIndex
+from typing import Any, SupportsIndex
 
 import numpy as np
 
@@ -52,15 +52,12 @@ def train(
     Raises:
         UserError: something you can mend, said in one line.
     """
-    made = isinstance(env, str) or callable(env)
-    require(made, f"env is {type(env).__name__}, expected a Gymnasium id or a function that makes an environment")
+    make_env = _maker(env)
     require(isinstance(seeds, Iterable), f"seeds is {seeds}, expected a list of numbers, as in [{seeds}]")
     agent = agent_config(env=env if isinstance(env, str) else None) if config is None else config
     kinds = tuple(CONFIGS.values())
     given = agent.__name__ if isinstance(agent, type) else type(agent).__name__
-    require(
-        isinstance(agent, kinds), f"config is {given}, expected an MBDPGConfig(...) or a rival's, made by calling it"
-    )
+    require(type(agent) in kinds, f"config is {given}, expected an MBDPGConfig(...) or a rival's, made by calling it")
     settings = RunConfig(
         env=env if isinstance(env, str) else _name(env) or "environment made in code",
         agent=agent,
@@ -69,7 +66,7 @@ def train(
         demonstrations=None if demonstrations is None else str(demonstrations),
     )
     return run.train(
-        settings, seeds=seeds, out=Path(out), make_env=_maker(env), on_update=_only_evaluations(on_evaluation)
+        settings, seeds=seeds, out=Path(out), make_env=make_env, on_update=_only_evaluations(on_evaluation)
     )
 
 
@@ -118,8 +115,13 @@ def evaluate(env: Env, policy: Callable[[np.ndarray], np.ndarray], *, episodes: 
         policy: actions in [-1, 1] from raw observations.
         episodes: how many.
         seed: decides the episodes' own seeds.
+
+    Raises:
+        UserError: an argument is wrong, or an action is not finite or of another shape than the environment's.
     """
     make = _maker(env)
+    require(episodes >= 1, f"episodes is {episodes}, expected at least 1")
+    require(seed >= 0, f"seed is {seed}, expected at least 0")
     made = envs.make(str(env)) if make is None else make()
     try:
         return run_episodes(made, policy, [envs.episode_seed(seed, "test", i) for i in range(episodes)])
@@ -127,10 +129,12 @@ def evaluate(env: Env, policy: Callable[[np.ndarray], np.ndarray], *, episodes: 
         made.close()
 
 
-def _maker(env: Env | None) -> Callable[[], Environment] | None:
+def _maker(env: Any) -> Callable[[], Environment] | None:
     """A function that makes the environment and wraps it; None for a registered one."""
     if env is None or isinstance(env, str):
         return None
+    given = type(env).__name__
+    require(callable(env), f"env is {given}, expected a Gymnasium id or a function that makes an environment")
     return lambda: envs.wrap(env(), name=_name(env))
 
 

@@ -199,11 +199,10 @@ class Phase(NamedTuple):
     name: str
     """As in `fitting` or `improving`; `time/<name>` counts its seconds."""
     updates_per_step: float
-    """Gradient steps per environment step, once `after_steps` have passed."""
-    after_steps: int
+    """Gradient steps per environment step after the random ones."""
     sampling: Sampling
     first_updates: int = 0
-    """Gradient steps taken at once when `after_steps` have passed, rounded up to as many as one call takes."""
+    """Gradient steps taken at once after the random environment steps, rounded up to as many as one call takes."""
     update: Callable[..., tuple[Any, Metrics]] = lambda state, batch, *, key: (state, {})
     """update(state, batch, *, key) -> (state, metrics): pure, for one seed, traced by JAX."""
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import mbdpg
+from mbdpg.storage.run_folder import RunFolder
 from mbdpg.training.collector import Collector
 
 
@@ -39,6 +40,10 @@ SCHEDULE = mbdpg.Schedule(
     steps=40, cycle=10, evaluate_every=20, evaluation_episodes=2, log_every=20, checkpoint_every=20
 )
 CONFIG = mbdpg.TD3Config(width=3, random_steps=20)
+
+
+class OwnConfig(mbdpg.TD3Config):
+    """Which no run folder could hold."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -134,6 +139,19 @@ def test_exploration_follows_the_reference_return_that_one_s_own_environment_is_
         assert len(seen) >= 4 and set(seen) == {reference}
 
 
+@pytest.mark.parametrize("bad", [0.0, np.full(1, np.nan), np.zeros(2)], ids=["number", "nan", "long"])
+def test_a_policy_s_bad_action_is_not_the_environment_s_fault(bad: Any) -> None:
+    """Every episode was dropped as one in which the environment failed."""
+    with pytest.raises(mbdpg.UserError, match="mend the policy$"):
+        mbdpg.evaluate(slider, lambda observation: bad)
+
+
+def test_an_old_id_is_recorded_as_what_was_run(tmp_path: Path) -> None:
+    """Reports put Hopper-v3 and Hopper-v5, which it had become, into two tables."""
+    (folder,) = mbdpg.train("Hopper-v3", config=CONFIG, schedule=SCHEDULE, out=tmp_path)
+    assert RunFolder.open(folder).config["env"] == "Hopper-v5"
+
+
 def test_a_function_that_makes_the_environment_will_do(tmp_path: Path) -> None:
     (folder,) = mbdpg.train(
         lambda: gymnasium.make("Pendulum-v1", max_episode_steps=15), config=CONFIG, schedule=SCHEDULE, out=tmp_path
@@ -183,8 +201,9 @@ def test_everything_public_is_there_and_explained() -> None:
         ({"seeds": 3}, r"seeds is 3, expected a list of numbers, as in \[3\]"),
         ({"config": "td3"}, "config is str, expected an MBDPGConfig"),
         ({"config": mbdpg.TD3Config}, "config is Config, expected an MBDPGConfig"),
+        ({"config": OwnConfig()}, "config is OwnConfig, expected an MBDPGConfig"),
     ],
-    ids=["an environment made already", "one seed", "an algorithm's name", "a class"],
+    ids=["an environment made already", "one seed", "an algorithm's name", "a class", "one's own config"],
 )
 def test_what_is_no_environment_list_or_config_is_refused_in_one_line(
     tmp_path: Path, changes: dict[str, Any], said: str
@@ -193,3 +212,19 @@ def test_what_is_no_environment_list_or_config_is_refused_in_one_line(
     train: Any = inspect.unwrap(mbdpg.train)  # without the types' check, which only tests have
     with pytest.raises(mbdpg.UserError, match=said):
         train(**given)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"env": slider()}, "env is TimeLimit, expected a Gymnasium id or a function"),
+        ({"episodes": 0}, "episodes is 0, expected at least 1"),
+        ({"seed": -1}, "seed is -1, expected at least 0"),
+    ],
+    ids=["an environment made already", "no episode", "a negative seed"],
+)
+def test_an_evaluation_that_cannot_be_is_refused_in_one_line(changes: dict[str, Any], said: str) -> None:
+    given = {"env": slider, "policy": lambda observation: np.zeros(1)} | changes
+    evaluate: Any = inspect.unwrap(mbdpg.evaluate)
+    with pytest.raises(mbdpg.UserError, match=said):
+        evaluate(**given)

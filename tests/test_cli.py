@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import platform
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -178,6 +180,9 @@ def test_demonstrate_records_what_train_learns_from(say: Any, toys: None, tmp_pa
     assert said.status == 0, said.err
     first = json.loads((tmp_path / "run" / "seed-0" / "metrics.jsonl").read_text().splitlines()[0])
     assert first["expert_env_steps"] == 70
+    taught = tmp_path / "run" / "seed-0"  # an expert that had one itself costs what both took
+    said = say("demonstrate", "Pendulum-v1", "--out", tmp_path / "two.safetensors", "--expert", taught, *options)
+    assert f"they cost {40 + 70 + 2 * 15} environment steps" in said.out, said.err
     assert sorted(path.name for path in Path.cwd().iterdir()) == []
 
 
@@ -404,6 +409,8 @@ def test_a_study_that_cannot_be_is_refused(say: Any, flags: Any, said: str) -> N
 def test_a_sweep_that_cannot_be_is_refused(say: Any, flags: Any, said: str) -> None:
     check_refused(say("sweep", "Pendulum-v1", *flags), said)
     check_refused(say("sweep", "NoSuchTask-v0", "--search", "width=1:2"), "NoSuchTask-v0")
+    oracle = ("--algorithm", "mbpo", "--termination", "known", "--search", "width=1:2")
+    check_refused(say("sweep", "LunarLanderContinuous-v3", *oracle), "--termination")
     assert list(Path.cwd().iterdir()) == []
 
 
@@ -447,6 +454,33 @@ def test_an_expert_that_is_stopped_says_how_to_go_on_with_all_that_was_given(say
     run, file = "x/demonstrations-expert/seed-4", "x/demonstrations.safetensors"
     again = f"mbdpg demonstrate Ant-v5 --out {file} --seed 4 --observation-size 27 --expert {run}"
     assert said == Said(143, "", f"{go_on} {run}, then {again}, then this again with --demonstrations {file}\n")
+
+
+def test_what_training_would_refuse_is_refused_before_an_expert_is_trained_for_it(say: Any, trained: Path) -> None:
+    """It was said after the 200,000 steps of the expert."""
+    shutil.copytree(trained, "x/seed-0")
+    expert = ("--demonstrations", "expert")
+    check_refused(say("train", "Pendulum-v1", *expert, "--out", "x"), "x/seed-0 exists already", "another --out")
+    oracle = ("--algorithm", "mbpo", "--termination", "known")
+    check_refused(say("train", "LunarLanderContinuous-v3", *oracle, *expert, "--out", "y"), "--termination")
+    check_refused(say("demonstrate", "LunarLanderContinuous-v3", "--out", "x"), "--out is x, a folder")
+    assert [path.name for path in Path("x").iterdir()] == ["seed-0"] and not Path("y").exists()
+
+
+def test_what_there_is_to_type_can_be_typed(say: Any, toys: None, monkeypatch: Any) -> None:
+    """Folders with spaces were not quoted, and an id that names a module was refused without --allow-import."""
+    said = say("train", "Pendulum-v1", *TINY, "--out", "my runs")
+    assert "next: mbdpg evaluate 'my runs/seed-0' --episodes 10 --video 'my runs/policy.mp4'\n" in said.out
+
+    def stopped(self: Any, update: Any) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr("mbdpg.reports.console.RunDisplay.__call__", stopped)
+    flags = (*TINY, "--allow-import", "--out", "own runs")
+    said = say("train", "gymnasium:Pendulum-v1", *flags)
+    assert said.err.endswith("go on with: mbdpg resume 'own runs' --allow-import\n")
+    said = say("resume", "own runs", "--allow-import", "--steps", "60")
+    assert said.err.endswith("go on with: mbdpg resume 'own runs' --allow-import --steps 60\n")
 
 
 def test_an_expert_of_another_environment_is_refused(say: Any, trained: Path) -> None:

@@ -49,10 +49,9 @@ class ToyAgent:
     def __init__(self, env: EnvSpec, config: ToyConfig | None = None, phases: Sequence[Phase] = ()) -> None:
         self.config = config or ToyConfig()
         self.env = env
-        start = self.config.random_steps
         self.phases = tuple(phases) or (
-            Phase("fitting", 0.2, start, Sampling(3, 1, 2), 7, self.update),
-            Phase("improving", 1.0, start, Sampling(4, 0, 1), 0, self.update),
+            Phase("fitting", 0.2, Sampling(3, 1, 2), 7, self.update),
+            Phase("improving", 1.0, Sampling(4, 0, 1), 0, self.update),
         )
 
     def init(self, *, key: Any) -> ToyState:

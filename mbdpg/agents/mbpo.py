@@ -122,12 +122,12 @@ class MBPO:
         self._rollouts = c.elites * max(1, round(c.rollouts_per_step * c.imagine_every / c.elites))
         steps, judging = self._fitting.sampling, self._fitting.judging
         starts, real = (Sampling(size, burn_in=0, length=1) for size in (self._rollouts, max(self._real, 1)))
-        now, every = c.random_steps, 1.0 / c.imagine_every
+        every = 1.0 / c.imagine_every
         self.phases = (
-            Phase("fitting", c.fits_per_step, now, sampling=steps, first_updates=c.first_fits, update=self.fit),
-            Phase("judging", every, now, sampling=judging, first_updates=1, update=self.judge),
-            Phase("imagining", every, now, sampling=starts, first_updates=1, update=self.imagine),
-            Phase("improving", c.updates_per_step, now, sampling=real, update=self.improve),
+            Phase("fitting", c.fits_per_step, sampling=steps, first_updates=c.first_fits, update=self.fit),
+            Phase("judging", every, sampling=judging, first_updates=1, update=self.judge),
+            Phase("imagining", every, sampling=starts, first_updates=1, update=self.imagine),
+            Phase("improving", c.updates_per_step, sampling=real, update=self.improve),
         )
 
     def init(self, *, key: PRNGKeyArray) -> State:

@@ -89,7 +89,7 @@ class PETS:
         rates = (c.model_learning_rate, c.weight_decay)
         self._fitting = Fitting(c.members, c.model_width, *rates, c.fit_batch_size, judged=False)
         sampling = self._fitting.sampling
-        self.phases = (Phase("fitting", c.fits_per_step, c.random_steps, sampling, c.first_fits, self.fit),)
+        self.phases = (Phase("fitting", c.fits_per_step, sampling, c.first_fits, self.fit),)
 
     def init(self, *, key: PRNGKeyArray) -> World:
         """Fresh networks."""

@@ -81,9 +81,7 @@ class SAC:
         self.env = env
         self._optimizer = optax.apply_if_finite(optax.adam(config.learning_rate), max_consecutive_errors=10**9)
         sampling = Sampling(config.batch_size, burn_in=0, length=1)
-        self.phases = (
-            Phase("improving", config.updates_per_step, config.random_steps, sampling=sampling, update=self.update),
-        )
+        self.phases = (Phase("improving", config.updates_per_step, sampling=sampling, update=self.update),)
 
     def init(self, *, key: PRNGKeyArray) -> State:
         """Fresh networks; targets equal to what they follow."""

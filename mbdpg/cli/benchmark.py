@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
 from mbdpg.cli.flags import parse
 from mbdpg.experiments import benchmark as measuring
-from mbdpg.interfaces import require
-from mbdpg.storage.files import replace_durably
+from mbdpg.storage.files import replace_durably, require_place
 
 
 @dataclass(frozen=True)
@@ -30,8 +28,7 @@ def benchmark(args: list[str]) -> None:
     flags = parse(Benchmark, "benchmark", args)
     file = flags.json
     if file is not None:
-        fits = os.access(file.absolute().parent, os.W_OK) and not file.is_dir()
-        require(fits, f"--json is {file}, expected a file in a folder that can be written to")
+        require_place(file, "--json")
 
     def show(what: str, value: str, remark: str) -> None:
         print(f"{what:<28} {value:>14}  {remark}".rstrip(), flush=True)

@@ -18,6 +18,8 @@ from mbdpg.experiments.run import train
 from mbdpg.experiments.stopping import Stop
 from mbdpg.interfaces import require
 from mbdpg.reports.console import RunDisplay
+from mbdpg.storage.files import require_place
+from mbdpg.storage.run_folder import RunFolder
 
 
 @dataclass(frozen=True)
@@ -61,23 +63,24 @@ def make_demonstrations(flags: Demonstrate, args: Sequence[str], *, then: str = 
     require(0 <= flags.seed < 2**31, f"--seed is {flags.seed}, expected a whole number from 0 to 2^31 - 1")
     require(flags.episodes >= 1, f"--episodes is {flags.episodes}, expected at least 1")
     success = expert.success_in(flags.env, flags.env_options, flags.success_return)
-    run = flags.expert
-    if run is None:
-        folder = flags.out.parent / f"{flags.out.stem}-expert"
-        trained = folder / f"seed-{flags.seed}"
-        require(
-            not trained.exists(),
-            f"{trained} has an expert already: take it with --expert {trained}, after more training if it needs that "
-            f"({program()} resume {trained} --steps N), or choose another --out",
-        )
-        config = expert.config_of(flags.env, flags.steps, flags.env_options)
+    config = expert.config_of(flags.env, flags.steps, flags.env_options)
+    folder = flags.out.parent / f"{flags.out.stem}-expert"
+    run = flags.expert or folder / f"seed-{flags.seed}"
+    quoted = shlex.quote(str(run))
+    if flags.expert:
+        RunFolder.open(run)
+    require(
+        flags.expert is not None or not run.exists(),
+        f"{run} has an expert already: take it with --expert {quoted}, after more training if it needs that "
+        f"({program()} resume {quoted} --steps N), or choose another --out",
+    )
+    require_place(flags.out, "--out")
+    if flags.expert is None:
         with Stop() as stop:
             with RunDisplay(flags.steps) as display:
-                run = train(config, seeds=[flags.seed], out=folder, on_update=display, should_stop=stop)[0]
+                train(config, seeds=[flags.seed], out=folder, on_update=display, should_stop=stop)
             again = shlex.join([*args, "--expert", str(run)])
-            stop.exit_if_asked(
-                f"{program()} resume {shlex.quote(str(run))}, then {program()} demonstrate {again}{then}"
-            )
+            stop.exit_if_asked(f"{program()} resume {quoted}, then {program()} demonstrate {again}{then}")
     found = expert.record_from(
         run,
         flags.env,

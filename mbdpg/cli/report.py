@@ -12,8 +12,9 @@ from mbdpg.cli.flags import parse
 from mbdpg.interfaces import require
 from mbdpg.reports.comparison import NO_COMMON_STEP, run_folders, table
 from mbdpg.reports.contents import compared, contents
-from mbdpg.reports.page import check_place, write_page
+from mbdpg.reports.page import write_page
 from mbdpg.reports.record import read_records
+from mbdpg.storage.files import require_place
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ def report(args: list[str]) -> None:
     flags = parse(Report, "report", args)
     require(len(flags.runs) > 0, "no run was given; expected run folders, or a folder that holds some")
     if flags.out is not None:
-        check_place(flags.out)
+        require_place(flags.out, "--out", suffix=".html")
     left_out: list[str] = []
     runs = read_records(run_folders(flags.runs), leave_out=left_out.append)
     for reason in left_out:

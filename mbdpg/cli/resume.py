@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -51,5 +52,5 @@ def resume(args: list[str]) -> None:
                 return displays.enter_context(RunDisplay(config.schedule.steps, done=env_steps))
 
             resuming.resume(runs, steps=flags.steps, allow_import=flags.allow_import, watch=display, should_stop=stop)
-        stop.exit_if_asked(f"{program()} resume {flags.run}")
+        stop.exit_if_asked(shlex.join([program(), "resume", *args]))
     finish(runs)

@@ -13,6 +13,7 @@ from mbdpg.cli.flags import default_folder, program, run_flags
 from mbdpg.cli.places import Places, engine_of, made, say
 from mbdpg.experiments import presets
 from mbdpg.experiments.config import Algorithm, RunConfig
+from mbdpg.experiments.run import check_task
 from mbdpg.experiments.search import Search
 from mbdpg.experiments.stopping import Stop
 from mbdpg.experiments.sweep import sweep as search_settings
@@ -53,7 +54,7 @@ def sweep(args: list[str]) -> None:
     checked_seeds(run.seeds)
     searches = [Search.parse(text, config.agent) for text in run.search]
     require(len({search.name for search in searches}) == len(searches), "--search has a setting twice")
-    config.make_env().close()  # a wrong task is better said once than by every trial
+    check_task(config)  # a wrong one is better said once than by every trial
     engine = engine_of(run.places)
     out = made(run.out or default_folder("sweeps", config), "the folder of a sweep")
     say(f"{run.trials} trials in {out}")

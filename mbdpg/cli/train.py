@@ -16,6 +16,7 @@ from mbdpg.experiments import presets, run
 from mbdpg.experiments.compilations import keep_compilations
 from mbdpg.experiments.config import Algorithm, RunConfig
 from mbdpg.experiments.stopping import Stop
+from mbdpg.interfaces import UserError
 from mbdpg.reports.comparison import grouped
 from mbdpg.reports.console import RunDisplay
 from mbdpg.reports.record import read_records
@@ -49,6 +50,9 @@ def train(args: list[str]) -> None:
     config = RunConfig(flags.env, flags.agent, flags.schedule, flags.env_options)
     out = flags.run.out or default_folder("runs", config)
     if flags.run.demonstrations == "expert":
+        run.check_task(config)
+        for taken in (folder for seed in flags.run.seeds if (folder := out / f"seed-{seed}").exists()):
+            raise UserError(f"{taken} exists already; resume it or choose another --out")
         file = out / "demonstrations.safetensors"
         teacher = Demonstrate(flags.env, file, seed=flags.run.seeds[0], env_options=flags.env_options)
         again = [flags.env, "--out", str(file), "--seed", str(teacher.seed), *as_flags(flags.env_options)]
@@ -59,7 +63,7 @@ def train(args: list[str]) -> None:
     with Stop() as stop:
         with RunDisplay(config.schedule.steps) as display:
             runs = run.train(config, seeds=flags.run.seeds, out=out, on_update=display, should_stop=stop)
-        stop.exit_if_asked(f"{program()} resume {out}")
+        stop.exit_if_asked(shlex.join([program(), "resume", str(out), *_imports(config)]))
     finish(runs)
 
 
@@ -74,8 +78,14 @@ def finish(runs: Sequence[Path]) -> None:
     folder = first.parent if first.name not in ("", "..") else Path(os.path.abspath(first)).parent
     beside = sorted(config.parent for config in folder.glob("*/config.json"))
     records = read_records(beside, leave_out=lambda why: print(f"mbdpg: not drawn: {why}", file=sys.stderr))
-    env = RunFolder.open(first).config["env"]
-    groups = {label: [run.folder for run in own] for label, own in grouped(records).get(env, {}).items()}
-    draw_curves(groups, folder / "learning-curve.png", title=env)
+    config = RunConfig.of(RunFolder.open(first))
+    groups = {label: [run.folder for run in own] for label, own in grouped(records).get(config.env, {}).items()}
+    draw_curves(groups, folder / "learning-curve.png", title=config.env)
     print(f"done: {folder}, learning curve in {folder / 'learning-curve.png'}")
-    print(f"next: {program()} evaluate {first} --episodes 10 --video {folder / 'policy.mp4'}")
+    film = ["--episodes", "10", "--video", str(folder / "policy.mp4")]
+    print("next:", shlex.join([program(), "evaluate", str(first), *film, *_imports(config)]))
+
+
+def _imports(config: RunConfig) -> list[str]:
+    """The flag without which no command makes the environment of an id that names a module."""
+    return ["--allow-import"] if config.env_options.allow_import else []

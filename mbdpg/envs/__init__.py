@@ -2,6 +2,7 @@
 
 from mbdpg.envs.make import (
     MakeGymnasium as MakeGymnasium,
+    current_id as current_id,
     episode_seed as episode_seed,
     make as make,
     wrap as wrap,

@@ -143,19 +143,27 @@ def episode_seed(run_seed: int, role: str, episode: int) -> int:
     return number << 29 | word >> 3
 
 
+def current_id(env_id: str) -> str:
+    """The id that stands in the place of one that is no longer in Gymnasium, which is said; any other as it is."""
+    if env_id in OLD_IDS:
+        _say_once(f"{env_id} is no longer in Gymnasium; using {OLD_IDS[env_id]}")
+    return OLD_IDS.get(env_id, env_id)
+
+
 def _known_id(env_id: str, allow_import: bool) -> str:
     """Returns the registered id that `env_id` means; imports its module first if it names one and that is allowed."""
     module, separator, name = env_id.rpartition(":")
     if separator:
         if not allow_import:
-            raise UserError(f"{env_id} would run the code of the module {module}; if you trust it, pass --allow-import")
+            raise UserError(
+                f"{env_id} would run the code of the module {module}; if you trust it, pass --allow-import, or in "
+                "Python a function that makes the environment"
+            )
         try:
             importlib.import_module(module)
         except ImportError as error:
             raise UserError(f"{env_id}: cannot import {module} ({error}); install it or set PYTHONPATH") from error
-    if name in OLD_IDS:
-        _say_once(f"{name} is no longer in Gymnasium; using {OLD_IDS[name]}")
-        return OLD_IDS[name]
+    name = current_id(name)
     if name not in gymnasium.registry:
         ids = {known.lower(): known for known in gymnasium.registry if known not in OLD_IDS}
         nearest = difflib.get_close_matches(name.lower(), ids, n=3, cutoff=0.0)

@@ -97,9 +97,11 @@ class GymnasiumEnvironment:
         """Maps [-1, 1] to the real bounds in float64, then casts to the dtype of the action space."""
         scaled = np.array(action, dtype=np.float64)
         if scaled.shape != self._action_shape:
-            raise ValueError(f"{self.spec.id} takes actions of shape {self._action_shape}, not {scaled.shape}")
+            raise UserError(
+                f"{self.spec.id} takes actions of shape {self._action_shape}, not {scaled.shape}; mend the policy"
+            )
         if np.count_nonzero(np.isfinite(scaled)) != scaled.size:  # half the time of isfinite().all()
-            raise ValueError(f"{self.spec.id} was not stepped: action {_first_non_finite(scaled)}")
+            raise UserError(f"{self.spec.id} was not stepped: action {_first_non_finite(scaled)}; mend the policy")
         np.minimum(scaled, self._one, out=scaled)
         np.maximum(scaled, self._minus_one, out=scaled)
         scaled *= self._half_range

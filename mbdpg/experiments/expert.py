@@ -7,9 +7,10 @@ from pathlib import Path
 
 from mbdpg.experiments.config import EnvOptions, RunConfig
 from mbdpg.experiments.presets import agent_config
-from mbdpg.experiments.run import load_policy, policy_facts
+from mbdpg.experiments.run import load_policy
 from mbdpg.imitation.demonstrations import Demonstrations, record
 from mbdpg.interfaces import UserError, require
+from mbdpg.storage.metrics import read_metrics
 from mbdpg.storage.run_folder import RunFolder
 from mbdpg.training.loop import Schedule
 
@@ -57,6 +58,8 @@ def record_from(
         UserError: there was no success, it is no run, or its policy is for another environment.
     """
     RunFolder.open(run)
+    evaluated = read_metrics(run, "eval")
+    cost = sum(evaluated[name][-1] for name in ("env_steps", "expert_env_steps") if evaluated["env_steps"])
     made = RunConfig(env, env_options=env_options).make_env()
     try:
         policy = load_policy(run, best=True, spec=made.spec)
@@ -65,7 +68,7 @@ def record_from(
             policy,
             episodes=episodes,
             success_return=success_return,
-            expert_env_steps=int(policy_facts(run)["env_steps"]),
+            expert_env_steps=cost,
             seed=seed,
         )
     finally:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -139,7 +140,7 @@ class Recorded:
         """
         replay = Replay.from_columns({name: column[:steps] for name, column in load_checkpoint(run).replay.items()})
         saved = f"{run} has saved {replay.size:,} of {steps:,} steps to learn from"
-        require(replay.size == steps, f"{saved}; go on with it: mbdpg resume {run}")
+        require(replay.size == steps, f"{saved}; go on with it: mbdpg resume {shlex.quote(str(run))}")
         start = replay.columns()["start"]
         starts, episode = np.unique(start, return_inverse=True)
         held_out = episode % HELD_OUT == HELD_OUT - 1

@@ -84,7 +84,7 @@ def _saved(path: Path, stack: contextlib.ExitStack, has_env: bool, steps: int | 
     stack.enter_context(folder.locked())
     checkpoint = load_checkpoint(path)
     with _as_written_by_us([path], checkpoint.env_steps):
-        planned = max(int(checkpoint.facts["steps"]), config.schedule.steps)
+        planned = int(checkpoint.facts["steps"])
     require(
         steps is None or steps >= checkpoint.env_steps,
         f"--steps is {steps}, but {path} has {checkpoint.env_steps} behind it; expected at least as many",

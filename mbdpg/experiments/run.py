@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, SupportsIndex
+from typing import SupportsIndex
 
+from mbdpg import envs
 from mbdpg.agents import mbdpg, mbpo, pets, sac, td3
 from mbdpg.dynamics.planning import PlanningPolicy, is_planner, planner_of
 from mbdpg.experiments.config import EnvOptions, RunConfig
@@ -55,6 +57,8 @@ def train(
         UserError: something the caller can mend; then no folder is left behind.
     """
     seeds = checked_seeds(seeds)
+    if make_env is None:  # what is recorded is what is run
+        config = dataclasses.replace(config, env=envs.current_id(config.env))
     make = make_env or config.make_env
     spec = spec_of(make, config.env_options)
     demonstrations = Demonstrations.load(Path(config.demonstrations), spec) if config.demonstrations else None
@@ -102,9 +106,13 @@ def load_policy(path: Path, *, best: bool = False, spec: EnvSpec | None = None) 
     return policy
 
 
-def policy_facts(path: Path) -> dict[str, Any]:
-    """The `env_steps` and evaluated `return_mean` of a run's latest policy."""
-    return read_array_file(path / "policy" / "latest.safetensors", "policy")[1]
+def check_task(config: RunConfig) -> None:
+    """Look that the environment and an agent for it can be made, before anything long begins.
+
+    Raises:
+        UserError: one cannot.
+    """
+    make_agent(config, spec_of(config.make_env, config.env_options))
 
 
 def make_agent(config: RunConfig, spec: EnvSpec) -> Agent:

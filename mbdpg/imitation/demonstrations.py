@@ -92,6 +92,7 @@ def record(
         if outcome.returns[0] >= success_return:
             kept.extend(outcome.steps.columns())
             returns.append(outcome.returns[0])
+    require(best > -np.inf, f"{env.spec.id} failed in all {tried} episodes of the expert (see above): mend it first")
     if not returns:
         raise UserError(
             f"none of {tried} episodes of the expert was a success: the best return was {best:.1f}, expected at least "

@@ -9,35 +9,16 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-import os
 from importlib import resources
 from pathlib import Path
 from string import Template
 from typing import Any
 
-from mbdpg.interfaces import UserError, require
-from mbdpg.storage.files import TEMPORARY, replace_durably, write_durably
+from mbdpg.interfaces import UserError
+from mbdpg.storage.files import replace_durably
 
 _ESCAPES = str.maketrans({sign: f"\\u{ord(sign):04x}" for sign in "<>&\u2028\u2029"})
 """In JSON these stand in strings alone, so a parser gives them back; no HTML parser sees an end of the block."""
-
-
-def check_place(path: Path) -> None:
-    """Look that the page can be written there, so that nobody waits for tables and then gets none.
-
-    Raises:
-        UserError: its ending is not .html, it is a folder, or it cannot be written.
-    """
-    require(path.suffix == ".html", f"--out is {path}, expected a name that ends in .html")
-    require(not os.path.isdir(path), f"--out is {path}, a folder; expected a file's name")
-    probe = path.with_name(TEMPORARY + path.name)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        probe.unlink(missing_ok=True)  # one that a crash left behind
-        write_durably(probe, b"")
-        probe.unlink()
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}") from error
 
 
 def write_page(path: Path, content: dict[str, Any]) -> None:

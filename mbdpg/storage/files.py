@@ -13,6 +13,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from mbdpg.interfaces import UserError, require
+
 TEMPORARY = ".tmp-"
 """Prefix of everything half-written; whatever bears it after a crash may be deleted."""
 
@@ -75,6 +77,31 @@ def replace_table(path: Path, rows: Iterable[Sequence[Any]]) -> None:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     replace_durably(path, text.getvalue().encode())
+
+
+def require_place(path: Path, flag: str, *, suffix: str = "") -> None:
+    """Look that a file can be written there, so that nobody waits for its content and then gets none.
+
+    The folder that it is to lie in is made.
+
+    Args:
+        path: where it is to be.
+        flag: that says so.
+        suffix: what its name must end in.
+
+    Raises:
+        UserError: it has another ending, it is a folder, or it cannot be written.
+    """
+    require(path.name.endswith(suffix), f"{flag} is {path}, expected a name that ends in {suffix}")
+    require(not os.path.isdir(path), f"{flag} is {path}, a folder; expected a file's name")
+    probe = path.with_name(TEMPORARY + path.name)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        probe.unlink(missing_ok=True)  # one that a crash left behind
+        write_durably(probe, b"")
+        probe.unlink()
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror}; choose another {flag}") from error
 
 
 def sync_folder(path: Path) -> None:

@@ -91,6 +91,7 @@ class Training:
         self._expert_env_steps = expert_env_steps
         self._updates = {phase.name: 0 for phase in learner.agent.phases}
         self._recorded = -1
+        self._ends_here = False
         self._saved: tuple[int, ...] = ()
         self._sums: list[dict[str, list[float]]] = [{} for _ in collectors]
         self._seconds = {"acting": 0.0, "evaluating": 0.0} | {phase.name: 0.0 for phase in learner.agent.phases}
@@ -106,12 +107,12 @@ class Training:
         with contextlib.suppress(StoppedError):
             while self._learn(should_stop):
                 policies, stds = self.learner.behaviors()
-                if self._recorded < self.env_steps:
+                if self._recorded < self.env_steps or self._ends_here:
                     on_update(self._record(stds, should_stop))
                 if self.env_steps >= self.schedule.steps or should_stop():
                     break
                 self._collect(policies, stds)  # Algorithm 1, line 5
-        if self._saved != (self.env_steps, *self._updates.values()):
+        if self._saved != (self.env_steps, *self._updates.values()) and not self._ends_here:
             self.save()
 
     def save(self) -> None:
@@ -139,6 +140,8 @@ class Training:
         self._updates = {name: int(facts[0]["updates"][name]) for name in self._updates}
         require(min(self._updates.values()) >= 0, "the checkpoint counts fewer than no updates")
         self._recorded = facts[0]["recorded"]
+        # What was to go on, and is now to end where it stands, has not recorded the end of a run yet.
+        self._ends_here = self.env_steps == self.schedule.steps < facts[0]["steps"]
         self._expert_env_steps = facts[0]["expert_env_steps"]
         self._sums = [dict(fact["sums"]) for fact in facts]
         self._before = [{name: float(fact["clock"][f"time/{name}"]) for name in self._before[0]} for fact in facts]
@@ -149,15 +152,18 @@ class Training:
         """Evaluate, log and save, each if it is due at this step."""
         schedule = self.schedule
         evaluation = self._evaluate(should_stop) if self._due(schedule.evaluate_every) else None
-        self._recorded = self.env_steps
-        if self._due(schedule.log_every):
+        log, save = self._due(schedule.log_every), self._due(schedule.checkpoint_every)
+        self._recorded, self._ends_here = self.env_steps, False
+        if log:
             self._log(stds)
-        if self._due(schedule.checkpoint_every):
+        if save:
             self.save()
         return Update(self.env_steps, [(c.returns or [np.nan])[-1] for c in self.collectors], evaluation)
 
     def _due(self, every: int) -> bool:
-        return self.env_steps % every == 0 or self.env_steps == self.schedule.steps
+        if self.env_steps % every == 0:
+            return self._recorded < self.env_steps
+        return self.env_steps == self.schedule.steps
 
     def _collect(self, policies: Sequence[Acting], stds: np.ndarray) -> None:
         began = time.monotonic()
@@ -177,8 +183,6 @@ class Training:
 
     def _take(self, phase: Phase, should_stop: Callable[[], bool]) -> bool:
         """Take a phase's updates that are due, always as many per call, so that it is compiled once."""
-        if self.env_steps < phase.after_steps:
-            return True
         if phase.sampling.demonstrated and not self.collectors[0].replay.demonstrated:
             return True
         began, cycle, rate = time.monotonic(), self.schedule.cycle, phase.updates_per_step
@@ -186,7 +190,7 @@ class Training:
         chunk = max(1, round(rate * cycle)) if rate else math.gcd(phase.first_updates, cycle)
         first = math.ceil(phase.first_updates / chunk) * chunk
         # Rounded first: 50 * 0.58 is a little less than 29, and would leave a cycle's updates to the next one.
-        due = first + int(round((self.env_steps - phase.after_steps) * rate, 6))
+        due = first + int(round((self.env_steps - self.learner.agent.config.random_steps) * rate, 6))
         while (done := self._updates[phase.name]) + chunk <= due and not should_stop():
             batches = [
                 c.replay.sample(chunk, phase.sampling, random_stream(c.seed, phase.name, done)) for c in self.collectors

@@ -38,12 +38,11 @@ def test_an_update_of_the_critics_and_actor_takes_no_weight_gradient_of_the_dyna
     assert counts["improving"] == 0 < counts["fitting"]
 
 
-@pytest.mark.parametrize("file", ["missing/numbers.json", "."])
-def test_where_nothing_can_be_written_nothing_is_measured(file: str, tmp_path: Path) -> None:
+def test_where_nothing_can_be_written_nothing_is_measured(tmp_path: Path) -> None:
     from mbdpg.cli import main
 
-    with pytest.raises(SystemExit, match="--json is .*, expected a file in a folder that can be written to"):
-        main(["benchmark", "--json", str(tmp_path / file)])
+    with pytest.raises(SystemExit, match="--json is .*, a folder; expected a file's name"):
+        main(["benchmark", "--json", str(tmp_path)])
 
 
 @pytest.mark.timeout(300)  # whole processes, a minute on a slow machine and three beside other work

@@ -85,6 +85,14 @@ def test_without_a_success_the_best_return_and_a_way_out_are_said() -> None:
     assert "--success-return" in str(caught.value) and "\n" not in str(caught.value)
 
 
+def test_where_the_environment_fails_in_every_episode_the_expert_is_not_blamed() -> None:
+    def fault(seed: int) -> None:
+        raise FloatingPointError("nan")
+
+    with pytest.raises(UserError, match="^Lottery-v0 failed in all 4 episodes of the expert"):
+        record(Lottery(fault), half, episodes=1, success_return=2.0, expert_env_steps=0, seed=0)
+
+
 def test_fewer_successes_than_asked_for_are_kept_after_four_times_as_many_trials() -> None:
     won = [seed % 4 == 3 for seed in SEEDS]
     count = next(count for count in range(1, 10) if 0 < sum(won[: 4 * count]) < count)
@@ -219,8 +227,8 @@ def test_training_from_demonstrations_clones_first_and_counts_their_cost(toy: An
     def make_agent(config: RunConfig, spec: EnvSpec) -> Any:
         agent = toy.ToyAgent(spec)
         agent.phases = (
-            Phase("cloning", 0.0, 20, clone, 6, agent.update),
-            Phase("improving", 1.0, 20, Sampling(4, 0, 1), 0, agent.update),
+            Phase("cloning", 0.0, clone, 6, agent.update),
+            Phase("improving", 1.0, Sampling(4, 0, 1), 0, agent.update),
         )
         return agent
 

@@ -17,8 +17,9 @@ from mbdpg.interfaces import UserError
 from mbdpg.reports import contents as contents_module
 from mbdpg.reports.comparison import run_folders
 from mbdpg.reports.contents import compared, contents
-from mbdpg.reports.page import check_place, page, write_page
+from mbdpg.reports.page import page, write_page
 from mbdpg.reports.record import read_records
+from mbdpg.storage.files import require_place
 
 Make = Callable[..., Path]
 ROOT = Path(__file__).resolve().parents[2]
@@ -206,7 +207,7 @@ def test_a_link_in_the_place_of_the_page_is_replaced_and_not_followed(tmp_path: 
     path = tmp_path / "page.html"
     path.symlink_to(tmp_path / "mine")
     (tmp_path / ".tmp-page.html").write_text("left by a crash")
-    check_place(path)
+    require_place(path, "--out", suffix=".html")
     write_page(path, content_of(make(tmp_path / "a", {0: 1.0})))
     assert (tmp_path / "mine").read_text() == "precious" and not path.is_symlink()
     assert sorted(os.listdir(tmp_path)) == ["a", "mine", "page.html"]

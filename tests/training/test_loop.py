@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import json
 import math
@@ -189,6 +190,24 @@ def test_a_finished_run_that_is_resumed_adds_nothing(whole: Any, toy: Any) -> No
     assert bytes_of(recorder.checkpoints[-1][1]) == bytes_of(arrays)
 
 
+@pytest.mark.parametrize(("at", "kinds"), [(15, ["eval", "train"]), (10, ["eval"])])
+def test_a_run_that_is_to_end_where_it_stands_is_evaluated_there(toy: Any, at: int, kinds: list[str]) -> None:
+    """It was said to have its steps already, and its last policy was never evaluated or saved."""
+    training, (recorder,) = toy.toy_training([0])
+    seen: list[int] = []
+    training.run(lambda update: seen.append(update.env_steps), lambda: at in seen)
+    env_steps, arrays, facts, columns = recorder.checkpoints[-1]
+    assert env_steps == at and facts["recorded"] == at
+    schedule = dataclasses.replace(training.schedule, steps=at)
+    for stop in True, False:  # asked to stop before it is evaluated, it is as it was
+        training, (recorder,) = toy.toy_training([0], replay=Replay.from_columns(columns), schedule=schedule)
+        training.restore(env_steps, [arrays], [facts])
+        run(training, lambda stop=stop: stop)
+        assert bool(recorder.checkpoints) != stop
+    assert [row["kind"] for row in recorder.rows] == kinds and len(recorder.policies) == 1
+    assert recorder.checkpoints[-1][2]["steps"] == at
+
+
 def counted(
     toy: Any, *phases: Phase, random_steps: int = 0, demonstrated: int = 0, cycle: int = 5
 ) -> list[dict[str, int]]:
@@ -224,37 +243,32 @@ DRAW = Sampling(2, 0, 1)
 
 
 def test_a_rate_below_one_update_per_cycle_is_kept_on_average(counts: Any) -> None:
-    assert [count["slow"] for count in counts(Phase("slow", 0.1, 0, DRAW))] == [0, 0, 1, 1, 2]
+    assert [count["slow"] for count in counts(Phase("slow", 0.1, DRAW))] == [0, 0, 1, 1, 2]
 
 
 def test_a_rate_whose_product_is_just_below_a_whole_number_loses_no_cycle(counts: Any) -> None:
     """50 * 0.58 is 28.999999999999996: the first two cycles had 0 and 29 updates, not 29 and 58."""
     assert 50 * 0.58 < 29
-    assert [count["rounded"] for count in counts(Phase("rounded", 0.58, 0, DRAW), cycle=50)] == [0, 29, 58, 87, 116]
+    assert [count["rounded"] for count in counts(Phase("rounded", 0.58, DRAW), cycle=50)] == [0, 29, 58, 87, 116]
 
 
 def test_first_updates_are_all_taken_though_they_are_not_a_multiple_of_anything(counts: Any) -> None:
-    assert [count["clone"] for count in counts(Phase("clone", 0.0, 5, DRAW, 7), random_steps=5)] == [0, 7, 7, 7, 7]
-    assert [count["clone"] for count in counts(Phase("clone", 0.0, 5, DRAW, 3), random_steps=5)] == [0, 3, 3, 3, 3]
+    assert [count["clone"] for count in counts(Phase("clone", 0.0, DRAW, 7), random_steps=5)] == [0, 7, 7, 7, 7]
+    assert [count["clone"] for count in counts(Phase("clone", 0.0, DRAW, 3), random_steps=5)] == [0, 3, 3, 3, 3]
 
 
 def test_few_first_updates_are_not_lost_before_others_that_come_many_at_once(counts: Any) -> None:
     """An ensemble that had none planned and imagined untrained."""
-    found = counts(Phase("few", 1.0, 5, DRAW, 3), random_steps=5)
+    found = counts(Phase("few", 1.0, DRAW, 3), random_steps=5)
     assert [count["few"] for count in found] == [0, 5, 10, 15, 20]
 
 
-def test_a_phase_that_begins_later_waits_with_its_first_updates_too(counts: Any) -> None:
-    found = counts(Phase("late", 1.0, 10, DRAW, 5), random_steps=5)
-    assert [count["late"] for count in found] == [0, 0, 5, 10, 15]
-
-
 def test_without_random_steps_learning_waits_for_the_first_transition(counts: Any) -> None:
-    assert [count["now"] for count in counts(Phase("now", 1.0, 0, DRAW, 5))] == [0, 10, 15, 20, 25]
+    assert [count["now"] for count in counts(Phase("now", 1.0, DRAW, 5))] == [0, 10, 15, 20, 25]
 
 
 def test_demonstrations_are_learned_from_before_the_first_step_and_only_if_there_are_any(counts: Any) -> None:
-    clone = Phase("clone", 0.0, 0, Sampling(2, 0, 1, demonstrated=True), 10)
+    clone = Phase("clone", 0.0, Sampling(2, 0, 1, demonstrated=True), 10)
     assert [count["clone"] for count in counts(clone, demonstrated=4)] == [10] * 5
     assert [count["clone"] for count in counts(clone)] == [0] * 5
 

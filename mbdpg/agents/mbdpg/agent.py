@@ -37,12 +37,12 @@ class MBDPG:
         cloned = Sampling(c.batch_size, burn_in=0, length=1, demonstrated=True)
         improved = Sampling(c.batch_size, c.burn_in, length=1, newest=c.recent_steps)
         grounded = Sampling(c.grounding_batch_size, 0, c.grounding_length, newest=c.recent_steps)
-        fitting = Phase("fitting", c.fits_per_step, c.random_steps, fitted, c.pretraining_fits, self.fit)
+        fitting = Phase("fitting", c.fits_per_step, fitted, c.pretraining_fits, self.fit)
         self.phases = (
-            Phase("cloning", 0.0, c.random_steps, cloned, c.cloning_updates, self.clone),
+            Phase("cloning", 0.0, cloned, c.cloning_updates, self.clone),
             *([fitting] if c.horizon > 0 else []),
-            Phase("improving", c.updates_per_step, c.random_steps, improved, 0, self.improve),
-            Phase("grounding", c.groundings_per_step, c.random_steps, grounded, 0, self.ground),
+            Phase("improving", c.updates_per_step, improved, 0, self.improve),
+            Phase("grounding", c.groundings_per_step, grounded, 0, self.ground),
         )
 
     def init(self, *, key: PRNGKeyArray) -> State:

@@ -62,7 +62,7 @@ class Config:
     target_update_every: int = 1
     """Updates of the critics, those on real returns too, between two of the targets, the paper's C."""
     average_share: float = 0.05
-    """Imagination uses an average of the dynamics, evaluation one of the actor, both fading over this share of updates."""
+    """Averages imagine (of the dynamics) and are evaluated (of the actor); they fade over this share of updates."""
     target_noise: float = 0.2
     """Standard deviation of the noise on target actions."""
     exploration_std: float = 0.3
