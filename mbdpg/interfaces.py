@@ -170,6 +170,8 @@ class Sampling(NamedTuple):
     """Where the drawn steps are."""
     newest: int = 0
     """Draw from so many of the newest steps alone; 0: from all."""
+    terminations: int = 0
+    """Beside the newest steps, draw from the last ones before so many of the newest terminations."""
 
 
 class Statistics(NamedTuple):

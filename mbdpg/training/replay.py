@@ -14,6 +14,9 @@ CONSTANT = 1e-6
 HELD_OUT = 5
 """Every so many-th step is held out from learning where an agent asks for it."""
 
+BEFORE_END = 50
+"""Last steps of an episode that terminated, its end included, that can outlast those around them."""
+
 LARGEST = float(np.finfo(np.float32).max)
 
 
@@ -128,12 +131,21 @@ class Replay:
         held_out = rows // HELD_OUT
         count = {"all": rows, "kept": rows - held_out, "held-out": max(held_out, 1)}[sampling.part]
         oldest = max(rows - sampling.newest, 0) if sampling.newest else 0
-        drawn = rng.integers(oldest, count, (updates, sampling.batch_size))
+        older = self._before_terminations(oldest, sampling.terminations)
+        drawn = rng.integers(oldest - older.size, count, (updates, sampling.batch_size))
+        if older.size:
+            drawn = np.where(drawn < oldest, older[np.minimum(drawn - oldest, -1)], drawn)
         if sampling.part == "kept":
             drawn += drawn // (HELD_OUT - 1)
         elif sampling.part == "held-out":
             drawn = np.minimum(drawn * HELD_OUT + HELD_OUT - 1, rows - 1)
         return self.windows(drawn, sampling)
+
+    def _before_terminations(self, oldest: int, count: int) -> np.ndarray:
+        """The last rows before each of the newest `count` terminations, those from row `oldest` on left out."""
+        ends = np.flatnonzero(self._columns["terminated"][: self.size])[-count:] if count else np.zeros(0, np.int64)
+        rows = (ends[:, None] - np.arange(BEFORE_END)[::-1]).ravel()
+        return rows[(rows >= np.repeat(self._columns["start"][ends], BEFORE_END)) & (rows < oldest)]
 
     def windows(self, row: np.ndarray, sampling: Sampling) -> Batch:
         """The steps around each given row; those outside its episode repeat the row itself and are not `valid`."""

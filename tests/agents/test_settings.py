@@ -25,6 +25,7 @@ IMPOSSIBLE = [
     (model_based.Config, "trace", -0.1),
     (model_based.Config, "average_share", 1.5),
     (model_based.Config, "imagination_ratio", 1.5),
+    (model_based.Config, "recent_terminations", 20),  # of no use without --recent-steps
     (model_based.Config, "target_update_every", 0),
     (model_based.Config, "actor_learning_rate", 0.0),
     (model_based.Config, "critic_learning_rate", float("inf")),

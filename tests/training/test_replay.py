@@ -277,6 +277,38 @@ def test_the_newest_steps_alone_are_drawn_where_the_sampling_says_so() -> None:
     assert window.observation[..., 0, 0].min() < min(newest)  # what came before is still remembered
 
 
+@pytest.mark.parametrize(
+    ("newest", "terminations", "rows"),
+    [
+        (3, 1, [*range(5, 12), 16, 17, 18]),
+        (3, 2, [*range(4), *range(5, 12), 16, 17, 18]),
+        (3, 9, [*range(4), *range(5, 12), 16, 17, 18]),
+        (10, 1, [*range(5, 19)]),
+        (19, 2, [*range(19)]),
+    ],
+)
+def test_the_last_steps_before_terminations_outlast_those_around_them(
+    newest: int, terminations: int, rows: list[int]
+) -> None:
+    sampling = Sampling(25, 0, 1, newest=newest, terminations=terminations)
+    drawn = filled().sample(400, sampling, np.random.default_rng(0)).observation[..., 0, 0]
+    found, counts = np.unique(drawn, return_counts=True)
+    assert found.tolist() == rows
+    assert np.abs(counts / 10_000 - 1 / len(rows)).max() < 0.01  # each as often as any other
+
+
+def test_of_a_long_episode_that_terminated_only_the_last_steps_stay() -> None:
+    replay = filled(rows_of((200, 5), ("terminated", "open")))
+    drawn = replay.sample(400, Sampling(10, 0, 1, newest=5, terminations=1), np.random.default_rng(0))
+    assert set(drawn.observation[..., 0, 0].ravel()) == set(range(150, 205))
+
+
+def test_while_the_newest_steps_hold_enough_terminations_draws_are_what_they_were() -> None:
+    ends = filled().sample(40, Sampling(10, 0, 2, newest=14, terminations=1), np.random.default_rng(0))
+    before = filled().sample(40, Sampling(10, 0, 2, newest=14), np.random.default_rng(0))
+    assert all(np.array_equal(a, b) for a, b in zip(ends, before, strict=True))
+
+
 def test_kept_and_held_out_steps_are_apart_and_together_all() -> None:
     replay = Replay(1, 1)
     for row in range(23):

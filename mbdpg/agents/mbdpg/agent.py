@@ -35,8 +35,9 @@ class MBDPG:
         c = config
         fitted = Sampling(c.fit_batch_size, c.burn_in, c.fit_length)
         cloned = Sampling(c.batch_size, burn_in=0, length=1, demonstrated=True)
-        improved = Sampling(c.batch_size, c.burn_in, length=1, newest=c.recent_steps)
-        grounded = Sampling(c.grounding_batch_size, 0, c.grounding_length, newest=c.recent_steps)
+        recent = Sampling(c.batch_size, 0, 1, newest=c.recent_steps, terminations=c.recent_terminations)
+        improved = recent._replace(burn_in=c.burn_in)
+        grounded = recent._replace(batch_size=c.grounding_batch_size, length=c.grounding_length)
         fitting = Phase("fitting", c.fits_per_step, fitted, c.pretraining_fits, self.fit)
         self.phases = (
             Phase("cloning", 0.0, cloned, c.cloning_updates, self.clone),

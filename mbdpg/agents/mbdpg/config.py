@@ -83,6 +83,8 @@ class Config:
     """A return goes on with weight e^(-d^2 / 2) past an action d times this (root mean square) from the policy's."""
     recent_steps: int = 0
     """Actor and critics learn from so many of the newest environment steps, the dynamics from all; 0: all from all."""
+    recent_terminations: int = 0
+    """With --recent-steps: the 50 steps before so many of the newest terminations stay, however old they are."""
     random_steps: int = 4000
     """Environment steps with uniformly random actions before learning starts."""
     fit_length: int = 5
@@ -133,5 +135,9 @@ class Config:
         climbs = self.terminal_value or (self.horizon > 0 and min(self.beta, self.final_beta) > 0)
         nothing = "without --terminal-value there is nothing to climb where --horizon, --beta or --final-beta is 0"
         require(climbs, nothing)
+        given = (
+            f"--recent-terminations is {self.recent_terminations}, expected 0 where --recent-steps is 0"
+        )
+        require(self.recent_steps > 0 or self.recent_terminations == 0, given)
         given = f"--imagination-ratio is {self.imagination_ratio}, expected 0 where --horizon is 0"
         require(self.horizon > 0 or self.imagination_ratio == 0, given)
