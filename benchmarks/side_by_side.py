@@ -26,7 +26,8 @@ import jax
 import numpy as np
 
 from mbdpg.agents.mbdpg import MBDPG
-from mbdpg.experiments.benchmark import PAPER_SIZES, TASK, made_up_batches, made_up_learner, phase_of, update_ms
+from mbdpg.experiments.benchmark import PAPER_SIZES, TASK, made_up_batches, made_up_learner, update_ms
+from mbdpg.interfaces import phase_of
 from mbdpg.storage.metrics import read_metrics
 from mbdpg.storage.run_folder import describe_machine
 from mbdpg.training.learner import Learner

@@ -46,6 +46,13 @@ def flag_of(setting: str) -> str:
     return "--" + setting.replace("_", "-")
 
 
+def as_flag(setting: str, value: Any) -> list[str]:
+    """What to type for a setting's value."""
+    if isinstance(value, bool):
+        return [flag_of(setting if value else f"no_{setting}")]
+    return [flag_of(setting), str(value)]
+
+
 def require_settings(
     config: Any, *, positive: Sequence[str] = (), at_most: Mapping[str, float] = {}, signed: Sequence[str] = ()
 ) -> None:
@@ -250,3 +257,8 @@ class Agent(Protocol):
 
     @property
     def diagnosis(self) -> Sampling: ...
+
+
+def phase_of(agent: Agent, name: str) -> Phase:
+    """An agent's phase by its name."""
+    return next(phase for phase in agent.phases if phase.name == name)

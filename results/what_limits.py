@@ -38,7 +38,7 @@ from mbdpg.dynamics.fitting import open_loop_error
 from mbdpg.dynamics.imagination import imagine
 from mbdpg.experiments.compilations import keep_compilations
 from mbdpg.experiments.config import RunConfig
-from mbdpg.interfaces import Environment, Sampling, require
+from mbdpg.interfaces import Environment, Sampling, phase_of, require
 from mbdpg.networks.policy import NumpyPolicy, policy_arrays
 from mbdpg.storage.checkpoint import load_checkpoint
 from mbdpg.storage.run_folder import RunFolder
@@ -110,7 +110,7 @@ def objective(options: argparse.Namespace) -> None:
     config, learner, rng = agent.config, Learner(agent, [options.seed]), np.random.default_rng(options.seed)
     learner.restore([arrays])
     state = jax.tree.map(lambda leaf: leaf[0], learner.state)
-    sampling = next(phase for phase in agent.phases if phase.name == "improving").sampling
+    sampling = phase_of(agent, "improving").sampling
     batches = [jax.tree.map(lambda x: x[0], replay.sample(1, sampling, rng)) for _ in range(BATCHES)]
     keys = list(jax.random.split(jax.random.key(options.seed), BATCHES))
 
@@ -171,7 +171,7 @@ def model(options: argparse.Namespace) -> None:
     tested = replay.windows(rng.choice(later, 1024), Sampling(1024, burn_in, max(DEPTHS)))
     learner = Learner(agent, [0])
     learner.prepare([replay.statistics(0.0)])
-    fitting = next(phase for phase in agent.phases if phase.name == "fitting")
+    fitting = phase_of(agent, "fitting")
 
     @jax.jit
     def measure(states: Any) -> Any:

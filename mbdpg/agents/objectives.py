@@ -6,7 +6,7 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from mbdpg.interfaces import Metrics
 
@@ -22,6 +22,13 @@ def clipped_value(values: Float[Array, "critic *batch"]) -> Float[Array, "*batch
 def climbed_value(values: Float[Array, "critic *batch"], actor_value: ActorValue) -> Float[Array, "*batch"]:
     """What the actor climbs: the clipped value, or the critics' mean, as in REDQ (Chen et al. 2021)."""
     return clipped_value(values) if actor_value == "clipped" else jnp.mean(values, axis=0)
+
+
+def smoothed_action(
+    action: Float[Array, "*batch"], std: float, clip: float, *, key: PRNGKeyArray
+) -> Float[Array, "*batch"]:
+    """Target policy smoothing (TD3, Fujimoto et al. 2018, Eq. 14): the action plus clipped normal noise, in [-1, 1]."""
+    return jnp.clip(action + jnp.clip(std * jax.random.normal(key, action.shape), -clip, clip), -1.0, 1.0)
 
 
 def temporal_difference_target(

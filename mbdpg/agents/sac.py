@@ -15,6 +15,7 @@ from mbdpg.agents import objectives
 from mbdpg.interfaces import Batch, EnvSpec, Metrics, Phase, Sampling, Statistics, require_settings
 from mbdpg.networks.critic import Critics
 from mbdpg.networks.normalizer import Normalizer, identity
+from mbdpg.networks.optimizer import adam
 from mbdpg.networks.policy import GaussianPolicy, Policy
 
 
@@ -79,7 +80,7 @@ class SAC:
     def __init__(self, config: Config, env: EnvSpec):
         self.config = config
         self.env = env
-        self._optimizer = optax.apply_if_finite(optax.adam(config.learning_rate), max_consecutive_errors=10**9)
+        self._optimizer = adam(config.learning_rate)
         sampling = Sampling(config.batch_size, burn_in=0, length=1)
         self.phases = (Phase("improving", config.updates_per_step, sampling=sampling, update=self.update),)
 

@@ -15,6 +15,7 @@ from mbdpg.agents import objectives
 from mbdpg.interfaces import Batch, EnvSpec, Metrics, Phase, Sampling, Statistics, require_settings
 from mbdpg.networks.critic import Critics
 from mbdpg.networks.normalizer import Normalizer, identity
+from mbdpg.networks.optimizer import adam
 from mbdpg.networks.policy import Policy
 
 
@@ -83,7 +84,7 @@ class TD3:
     def __init__(self, config: Config, env: EnvSpec):
         self.config = config
         self.env = env
-        self._optimizer = optax.apply_if_finite(optax.adam(config.learning_rate), max_consecutive_errors=10**9)
+        self._optimizer = adam(config.learning_rate)
         sampling = Sampling(config.batch_size, burn_in=0, length=1)
         self.phases = (Phase("improving", config.updates_per_step, sampling=sampling, update=self.update),)
 
@@ -127,9 +128,8 @@ class TD3:
         batch = jax.tree.map(lambda x: x[:, 0], batch)
         observation, after = state.normalizer(batch.observation), state.normalizer(batch.next_observation)
         next_action = state.target_actor(after)
-        noise = c.target_noise * jax.random.normal(key, next_action.shape)
-        noise = jnp.clip(noise, -c.target_noise_clip, c.target_noise_clip)
-        next_values = state.target_critics(after, jnp.clip(next_action + noise, -1.0, 1.0))
+        next_action = objectives.smoothed_action(next_action, c.target_noise, c.target_noise_clip, key=key)
+        next_values = state.target_critics(after, next_action)
         target = objectives.temporal_difference_target(
             batch.reward / state.return_scale, batch.terminated, objectives.clipped_value(next_values), c.discount
         )

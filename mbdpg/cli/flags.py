@@ -18,7 +18,7 @@ import tyro
 
 from mbdpg.experiments import presets
 from mbdpg.experiments.config import CONFIGS, EnvOptions, RunConfig
-from mbdpg.interfaces import one_line, require
+from mbdpg.interfaces import as_flag, one_line, require
 from mbdpg.training.loop import Schedule
 
 RunArgument = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
@@ -104,14 +104,9 @@ def default_folder(parent: str, config: RunConfig) -> Path:
 
 def as_flags(settings: Any) -> list[str]:
     """What to type for those settings of a dataclass that are not the defaults."""
-    flags: list[str] = []
-    for own in dataclasses.fields(settings):
-        value, name = getattr(settings, own.name), own.name.replace("_", "-")
-        if value != own.default:
-            flags += (
-                [f"--{name}" if value else f"--no-{name}"] if isinstance(value, bool) else [f"--{name}", str(value)]
-            )
-    return flags
+    values = {own.name: getattr(settings, own.name) for own in dataclasses.fields(settings)}
+    defaults = {own.name: own.default for own in dataclasses.fields(settings)}
+    return [word for name, value in values.items() if value != defaults[name] for word in as_flag(name, value)]
 
 
 def _plain(text: str) -> str:

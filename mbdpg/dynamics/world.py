@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from mbdpg.dynamics.ensemble import Ensemble, Units, ensemble_loss, held_out_error
 from mbdpg.interfaces import Batch, EnvSpec, Metrics, Part, Sampling
+from mbdpg.networks.optimizer import adam
 
 
 class World(eqx.Module):
@@ -56,7 +57,7 @@ class Fitting:
 
     @property
     def _optimizer(self) -> optax.GradientTransformation:
-        return optax.apply_if_finite(optax.adam(self.learning_rate), max_consecutive_errors=10**9)
+        return adam(self.learning_rate)
 
     def init(self, env: EnvSpec, *, key: PRNGKeyArray) -> World:
         """Fresh networks."""

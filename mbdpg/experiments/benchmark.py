@@ -24,7 +24,7 @@ from mbdpg.experiments.compilations import LEAST_SECONDS
 from mbdpg.experiments.config import RunConfig
 from mbdpg.experiments.origin import machine
 from mbdpg.experiments.products import matrix_products, median_seconds, product_seconds
-from mbdpg.interfaces import Agent, EnvSpec, Phase
+from mbdpg.interfaces import EnvSpec, Phase, phase_of
 from mbdpg.training.learner import Learner
 from mbdpg.training.replay import Replay
 
@@ -207,11 +207,6 @@ def made_up_learner(config: mbdpg.Config, seeds: int = 1) -> Learner:
     learner = Learner(mbdpg.MBDPG(config, SPEC), range(seeds))
     learner.prepare([_replay(ROWS).statistics(0.0)] * seeds)
     return learner
-
-
-def phase_of(agent: Agent, name: str) -> Phase:
-    """By its name."""
-    return next(phase for phase in agent.phases if phase.name == name)
 
 
 def made_up_batches(phase: Phase, updates: int) -> Any:

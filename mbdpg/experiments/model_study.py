@@ -22,7 +22,7 @@ from mbdpg.dynamics.fitting import open_loop_error
 from mbdpg.experiments.compilations import keep_compilations
 from mbdpg.experiments.config import RunConfig
 from mbdpg.experiments.work import is_made_as, refuse_made_otherwise, say_made_as
-from mbdpg.interfaces import Batch, Sampling, require
+from mbdpg.interfaces import Batch, Sampling, phase_of, require
 from mbdpg.storage.checkpoint import load_checkpoint
 from mbdpg.storage.files import replace_table
 from mbdpg.storage.run_folder import RunFolder
@@ -89,7 +89,7 @@ class ModelFit:
             learner.prepare([steps.replay.statistics(0.0)])
             if self.aggregation == "boosting":
                 learner.state = _boosted(agent, learner.state, members)
-            phase = next(phase for phase in agent.phases if phase.name == "fitting")
+            phase = phase_of(agent, "fitting")
             rows = steps.resampled(rng) if self.aggregation == "bagging" else steps.learned
             for done in range(0, self.updates, PER_CALL):
                 if should_stop():

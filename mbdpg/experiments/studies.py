@@ -162,9 +162,17 @@ def study(name: StudyName, scale: ScaleName) -> Study:
     return _STUDIES[name](SCALES[scale])
 
 
-def _cell(scale: Scale, env: str, label: str = "mbdpg", algorithm: str = "mbdpg", **settings: Any) -> Cell:
-    """Runs of an algorithm with some settings; `preset` and `demonstrated` are not the agent's."""
-    preset, demonstrated = settings.pop("preset", "default"), settings.pop("demonstrated", False)
+def _cell(
+    scale: Scale,
+    env: str,
+    label: str = "mbdpg",
+    algorithm: str = "mbdpg",
+    *,
+    preset: str = "default",
+    demonstrated: bool = False,
+    **settings: Any,
+) -> Cell:
+    """Runs of an algorithm, from demonstrations or not, with some settings other than the preset's."""
     agent = agent_config(algorithm, preset, env)
     size = ANT_OBSERVATION if env.startswith("Ant") else None
     options = EnvOptions(max_episode_steps=PAPER_EPISODE_LIMIT, observation_size=size)

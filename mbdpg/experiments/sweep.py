@@ -9,7 +9,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import starmap
+from itertools import chain, starmap
 from pathlib import Path
 from typing import Any, Literal, final
 
@@ -23,7 +23,7 @@ from mbdpg.experiments.config import RunConfig
 from mbdpg.experiments.launch import Engine, launch
 from mbdpg.experiments.search import Search
 from mbdpg.experiments.work import Training
-from mbdpg.interfaces import UserError, flag_of, require
+from mbdpg.interfaces import UserError, as_flag, require
 from mbdpg.reports.record import Curve, learning_curve, mean_curve
 from mbdpg.storage.files import DamagedFileError, parse_object, read_checked, replace_durably, replace_table
 from mbdpg.storage.run_folder import only_writer
@@ -214,15 +214,9 @@ def _conclude(works: Sequence[Trial], out: Path, say: Callable[[str], None]) -> 
     completed = sum(note.get("state") == "complete" for note in notes)
     say(f"{completed} of {len(works)} trials completed; all of them in {out / 'sweep.csv'}")
     best = max(scored, key=lambda note: values[note["trial"]])
-    say(f"best, {values[best['trial']]:,.1f}: {' '.join(starmap(_as_flag, best['settings'].items()))}")
+    flags = chain.from_iterable(starmap(as_flag, best["settings"].items()))
+    say(f"best, {values[best['trial']]:,.1f}: {' '.join(flags)}")
     _draw(study, done, out, say)
-
-
-def _as_flag(name: str, value: Any) -> str:
-    """What to give `mbdpg train` for a setting."""
-    if isinstance(value, bool):
-        return flag_of(name if value else f"no_{name}")
-    return f"{flag_of(name)} {value}"
 
 
 def _draw(study: Any, done: Sequence[Any], out: Path, say: Callable[[str], None]) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from mbdpg.agents.mbpo import MBPO, Config, State
 from mbdpg.dynamics.ensemble import predict
-from mbdpg.interfaces import Batch, EnvSpec, Statistics, UserError
+from mbdpg.interfaces import Batch, EnvSpec, Statistics, UserError, phase_of
 
 O, A, BATCH = 3, 2, 8
 ENV = EnvSpec("made-in-code", observation_size=O, action_size=A, episode_limit=None, reference_return=None)
@@ -60,7 +60,7 @@ def batch(size: int, seed: int = 1) -> Batch:
 def take(name: str, before: State, one: MBPO | None = None, seed: int = 1) -> tuple[State, dict[str, Any]]:
     """One update of a phase."""
     one = one or agent()
-    phase = next(phase for phase in one.phases if phase.name == name)
+    phase = phase_of(one, name)
     return jax.jit(phase.update)(before, batch(phase.sampling.batch_size, seed), key=jax.random.key(seed))
 
 

@@ -171,9 +171,8 @@ class MBDPG:
 
     def _target_value(self, state: State, observation: Array, *, key: PRNGKeyArray) -> Array:
         """Clipped value of the target policy's action, smoothed as in TD3."""
-        action = state.target_actor(observation)
-        noise = jnp.clip(self.config.target_noise * jax.random.normal(key, action.shape), -0.5, 0.5)
-        return objectives.clipped_value(state.target_critics(observation, jnp.clip(action + noise, -1.0, 1.0)))
+        action = objectives.smoothed_action(state.target_actor(observation), self.config.target_noise, 0.5, key=key)
+        return objectives.clipped_value(state.target_critics(observation, action))
 
     def _step_critics(self, state: State, gradient: Critics) -> State:
         """Step the critics, then let the targets follow every C-th time."""

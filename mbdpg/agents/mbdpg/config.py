@@ -64,7 +64,7 @@ class Config:
     average_share: float = 0.05
     """Averages imagine (of the dynamics) and are evaluated (of the actor); they fade over this share of updates."""
     target_noise: float = 0.2
-    """Standard deviation of the noise on target actions."""
+    """Standard deviation of the noise on target actions, which is clipped at 0.5."""
     exploration_std: float = 0.3
     """Standard deviation of the behavior policy, its mean over episodes, while returns are a random policy's."""
     final_exploration_std: float = 0.1
@@ -135,9 +135,7 @@ class Config:
         climbs = self.terminal_value or (self.horizon > 0 and min(self.beta, self.final_beta) > 0)
         nothing = "without --terminal-value there is nothing to climb where --horizon, --beta or --final-beta is 0"
         require(climbs, nothing)
-        given = (
-            f"--recent-terminations is {self.recent_terminations}, expected 0 where --recent-steps is 0"
-        )
+        given = f"--recent-terminations is {self.recent_terminations}, expected 0 where --recent-steps is 0"
         require(self.recent_steps > 0 or self.recent_terminations == 0, given)
         given = f"--imagination-ratio is {self.imagination_ratio}, expected 0 where --horizon is 0"
         require(self.horizon > 0 or self.imagination_ratio == 0, given)

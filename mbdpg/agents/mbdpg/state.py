@@ -17,6 +17,7 @@ from mbdpg.dynamics.mixture import MixtureDynamics, Scales
 from mbdpg.interfaces import Batch, EnvSpec
 from mbdpg.networks.critic import Critics
 from mbdpg.networks.normalizer import Normalizer, identity
+from mbdpg.networks.optimizer import adam
 from mbdpg.networks.policy import Policy
 
 
@@ -75,17 +76,11 @@ class Optimizers(NamedTuple):
 
 
 def optimizers(config: Config) -> Optimizers:
-    """Adam behind a global-norm clip; a gradient that is not finite is skipped and counted."""
-
-    def one(learning_rate: float, clip: float) -> optax.GradientTransformation:
-        return optax.apply_if_finite(
-            optax.chain(optax.clip_by_global_norm(clip), optax.adam(learning_rate)), max_consecutive_errors=10**9
-        )
-
+    """Adam behind a global-norm clip for each."""
     return Optimizers(
-        dynamics=one(config.dynamics_learning_rate, config.dynamics_clip),
-        actor=one(config.actor_learning_rate, config.actor_clip),
-        critic=one(config.critic_learning_rate, config.critic_clip),
+        dynamics=adam(config.dynamics_learning_rate, clip=config.dynamics_clip),
+        actor=adam(config.actor_learning_rate, clip=config.actor_clip),
+        critic=adam(config.critic_learning_rate, clip=config.critic_clip),
     )
 
 
