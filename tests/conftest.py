@@ -56,11 +56,11 @@ FLAGS = {
     "td3": ("--algorithm", "td3", *SMALL),
     "sac": ("--algorithm", "sac", *SMALL),
     "pets": (
-        *("--algorithm", "pets", "--random-steps", "100", *EVERY_100, "--model-width", "8", "--fit-batch-size", "8"),
-        *("--first-fits", "10", "--horizon", "2", "--population", "4", "--plan-elites", "2"),
+        *("--algorithm", "pets", "--random-steps", "100", *EVERY_100, "--dynamics-width", "8", "--fit-batch-size", "8"),
+        *("--pretraining-fits", "10", "--horizon", "2", "--population", "4", "--plan-elites", "2"),
     ),
     "mbpo": (
-        *("--algorithm", "mbpo", *SMALL, "--model-width", "8", "--fit-batch-size", "8", "--first-fits", "10"),
+        *("--algorithm", "mbpo", *SMALL, "--dynamics-width", "8", "--fit-batch-size", "8", "--pretraining-fits", "10"),
         *("--rollouts-per-step", "2", "--imagine-every", "50", "--retained-steps", "100"),
     ),
     "mbdpg": (

@@ -49,15 +49,15 @@ class Config(sac.Config):
     """Networks of the ensemble."""
     elites: int = 5
     """Those with the least held-out error, which alone are rolled out."""
-    model_width: int = 200
+    dynamics_width: int = 200
     """Width of each of their four hidden layers."""
-    model_learning_rate: float = 1e-3
+    dynamics_learning_rate: float = 1e-3
     """Adam's step size for the ensemble."""
     weight_decay: float = 5e-5
     """Weight of half the ensemble's squared weights in its loss."""
     fits_per_step: float = 1.0
     """Updates of the ensemble per environment step."""
-    first_fits: int = 2000
+    pretraining_fits: int = 2000
     """Updates of the ensemble when the random steps are over."""
     fit_batch_size: int = 256
     """Transitions per update and member, drawn anew for each."""
@@ -65,7 +65,7 @@ class Config(sac.Config):
     def __post_init__(self) -> None:
         learned = ("batch_size", "updates_per_step", "learning_rate", "initial_temperature", "layers", "width")
         imagined = ("rollouts_per_step", "imagine_every", "retained_steps", "rollout_length", "final_rollout_length")
-        fitted = ("members", "elites", "model_width", "model_learning_rate", "fit_batch_size")
+        fitted = ("members", "elites", "dynamics_width", "dynamics_learning_rate", "fit_batch_size")
         shares = ("discount", "target_update_rate", "exploration_scatter", "real_share")
         require_settings(
             self,
@@ -115,8 +115,8 @@ class MBPO:
         self.env = env
         self._sac = sac.SAC(c, env)
         self._rule = RULES[known_rule(env)] if c.termination == "known" else None
-        rates = (c.model_learning_rate, c.weight_decay)
-        self._fitting = Fitting(c.members, c.model_width, *rates, c.fit_batch_size, judged=True)
+        rates = (c.dynamics_learning_rate, c.weight_decay)
+        self._fitting = Fitting(c.members, c.dynamics_width, *rates, c.fit_batch_size, judged=True)
         self._real = min(round(c.real_share * c.batch_size), c.batch_size)
         # As many for every elite.
         self._rollouts = c.elites * max(1, round(c.rollouts_per_step * c.imagine_every / c.elites))
@@ -124,7 +124,7 @@ class MBPO:
         starts, real = (Sampling(size, burn_in=0, length=1) for size in (self._rollouts, max(self._real, 1)))
         every = 1.0 / c.imagine_every
         self.phases = (
-            Phase("fitting", c.fits_per_step, sampling=steps, first_updates=c.first_fits, update=self.fit),
+            Phase("fitting", c.fits_per_step, sampling=steps, first_updates=c.pretraining_fits, update=self.fit),
             Phase("judging", every, sampling=judging, first_updates=1, update=self.judge),
             Phase("imagining", every, sampling=starts, first_updates=1, update=self.imagine),
             Phase("improving", c.updates_per_step, sampling=real, update=self.improve),

@@ -40,15 +40,15 @@ class Config:
     """How imagined episodes end: as the ensemble has learned, or by the simulator's own rule, known for some tasks."""
     members: int = 5
     """Networks of the ensemble."""
-    model_width: int = 128
+    dynamics_width: int = 128
     """Width of each of their four hidden layers."""
-    model_learning_rate: float = 1e-3
+    dynamics_learning_rate: float = 1e-3
     """Adam's step size for the ensemble."""
     weight_decay: float = 5e-5
     """Weight of half the ensemble's squared weights in its loss."""
     fits_per_step: float = 1.0
     """Updates of the ensemble per environment step."""
-    first_fits: int = 1000
+    pretraining_fits: int = 1000
     """Updates of the ensemble when the random steps are over."""
     fit_batch_size: int = 256
     """Transitions per update and member, drawn anew for each."""
@@ -63,7 +63,7 @@ class Config:
 
     def __post_init__(self) -> None:
         planned = ("horizon", "particles", "population", "plan_elites", "iterations")
-        fitted = ("members", "model_width", "model_learning_rate", "fit_batch_size")
+        fitted = ("members", "dynamics_width", "dynamics_learning_rate", "fit_batch_size")
         require_settings(
             self,
             positive=(*planned, *fitted),
@@ -86,10 +86,10 @@ class PETS:
         self.env = env
         self._rule = known_rule(env) if c.termination == "known" else None
         # All members plan, so no step is held out to choose among them.
-        rates = (c.model_learning_rate, c.weight_decay)
-        self._fitting = Fitting(c.members, c.model_width, *rates, c.fit_batch_size, judged=False)
+        rates = (c.dynamics_learning_rate, c.weight_decay)
+        self._fitting = Fitting(c.members, c.dynamics_width, *rates, c.fit_batch_size, judged=False)
         sampling = self._fitting.sampling
-        self.phases = (Phase("fitting", c.fits_per_step, sampling, c.first_fits, self.fit),)
+        self.phases = (Phase("fitting", c.fits_per_step, sampling, c.pretraining_fits, self.fit),)
 
     def init(self, *, key: PRNGKeyArray) -> World:
         """Fresh networks."""

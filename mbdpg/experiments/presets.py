@@ -52,7 +52,7 @@ PAPER: dict[str, dict[str, Any]] = {
         "population": 500,
         "plan_elites": 50,
         "iterations": 5,
-        "model_width": 200,
+        "dynamics_width": 200,
         "random_steps": 1000,
     },
     # jannerm/mbpo.

@@ -79,7 +79,7 @@ SCALES: dict[ScaleName, Scale] = {
         rivals="default",
         tiny={
             **{"random_steps": 200, "width": 16, "memory": 16, "batch_size": 8, "fit_batch_size": 8},
-            **{"pretraining_fits": 10, "cloning_updates": 10, "first_fits": 10, "model_width": 16},
+            **{"pretraining_fits": 10, "cloning_updates": 10, "dynamics_width": 16},
             **{"population": 8, "plan_elites": 2, "updates_per_step": 0.1, "fits_per_step": 0.1},
         },
         success_share=-1e4,  # anything is one

@@ -60,7 +60,7 @@ class Linear(eqx.Module):
 
 
 class NormalizedELU(eqx.Module):
-    """Zero mean and unit variance over the last axis, a learned scale and offset (LayerNorm), then ELU."""
+    """Zero mean and unit variance over the last axis, scale and offset (LayerNorm, Ba et al. 2016), then ELU."""
 
     scale: Float[Array, " features"]
     offset: Float[Array, " features"]
@@ -73,13 +73,24 @@ class NormalizedELU(eqx.Module):
         return _normalized_elu(x, self.scale, self.offset)
 
 
+class LayerSlopes(NamedTuple):
+    """Of one hidden layer, row by row: what it saw, and a scalar output's derivatives by what it made of that."""
+
+    input: Float[Array, "row inputs"]
+    normalized: Float[Array, "row width"]
+    """Its products after LayerNorm, before scale and offset."""
+    by_product: Float[Array, "row width"]
+    """By the Linear layer's output."""
+    by_activation_input: Float[Array, "row width"]
+    """By what ELU is taken of."""
+
+
 class Slopes(NamedTuple):
     """A scalar network's outputs and, row by row, their derivatives: one way back through it for any weights."""
 
     output: Float[Array, " row"]
     by_input: Float[Array, "row inputs"]
-    hidden: tuple[tuple[Array, Array, Array, Array], ...]
-    """Per layer: its inputs, what it normalized, and the derivatives by its products and by its activations' inputs."""
+    hidden: tuple[LayerSlopes, ...]
     features: Float[Array, "row width"]
 
 
@@ -136,18 +147,21 @@ class MLP(eqx.Module):
         slope = jnp.broadcast_to(self.output.weight[:, 0], features.shape)
         hidden = []
         for linear, before, own in zip(self.hidden[::-1], inputs[::-1], saved[::-1], strict=True):
-            by_product, by_affine = _row_derivatives(own, slope)
-            hidden.append((before, own[0], by_product, by_affine))
+            by_product, by_activation_input = _row_derivatives(own, slope)
+            hidden.append(LayerSlopes(before, own.normalized, by_product, by_activation_input))
             slope = matrix_product(by_product, linear.weight.T)
         return Slopes(self.output(features)[:, 0], slope, tuple(hidden[::-1]), features)
 
     def weighted_gradient(self, slopes: Slopes, weights: Float[Array, " row"]) -> MLP:
         """The derivative of the outputs' weighted sum by every parameter."""
         hidden, norms = [], []
-        for before, normalized, by_product, by_affine in slopes.hidden:
-            by_product, by_affine = by_product * weights[:, None], by_affine * weights[:, None]
-            hidden.append((matrix_product(before.T, by_product), jnp.sum(by_product, axis=0)))
-            norms.append((jnp.sum(by_affine * normalized, axis=0), jnp.sum(by_affine, axis=0)))
+        for layer in slopes.hidden:
+            by_product, by_activation_input = (
+                slope * weights[:, None] for slope in (layer.by_product, layer.by_activation_input)
+            )
+            hidden.append((matrix_product(layer.input.T, by_product), jnp.sum(by_product, axis=0)))
+            by_scale = jnp.sum(by_activation_input * layer.normalized, axis=0)
+            norms.append((by_scale, jnp.sum(by_activation_input, axis=0)))
         output = matrix_product(slopes.features.T, weights[:, None]), jnp.sum(weights)[None]
         return jax.tree.unflatten(jax.tree.structure(self), jax.tree.leaves((hidden, norms, output)))
 
@@ -157,12 +171,23 @@ def _along(vector: Float[Array, " features"], like: Array) -> Array:
     return vector.reshape((1,) * (like.ndim - 1) + vector.shape)
 
 
-def _normalize_and_activate(x: Array, scale: Array, offset: Array) -> tuple[Array, tuple[Array, ...]]:
+class _Saved(NamedTuple):
+    """What the derivative of LayerNorm and ELU needs of them."""
+
+    normalized: Float[Array, "*batch features"]
+    rate: Float[Array, "*batch 1"]
+    """One over the standard deviation."""
+    scale: Float[Array, " features"]
+    output: Float[Array, "*batch features"]
+
+
+def _normalize_and_activate(x: Array, scale: Array, offset: Array) -> tuple[Array, _Saved]:
+    """ELU(z * scale + offset), z = (x - mean) / sqrt(variance + 1e-5) over the last axis."""
     centred = x - jnp.mean(x, axis=-1, keepdims=True)
     rate = jax.lax.rsqrt(jnp.mean(jnp.square(centred), axis=-1, keepdims=True) + 1e-5)
     normalized = centred * rate
     y = elu(normalized * _along(scale, x) + _along(offset, x))
-    return y, (normalized, rate, scale, y)
+    return y, _Saved(normalized, rate, scale, y)
 
 
 @jax.custom_vjp
@@ -171,19 +196,21 @@ def _normalized_elu(x: Array, scale: Array, offset: Array) -> Array:
     return _normalize_and_activate(x, scale, offset)[0]
 
 
-def _row_derivatives(saved: tuple[Array, ...], gradient: Array) -> tuple[Array, Array]:
-    """By x, and by what ELU was taken of."""
-    normalized, rate, scale, y = saved
-    inner = gradient * jnp.minimum(y + 1.0, 1.0)  # the slope of ELU is exp(x) = y + 1 below zero and 1 above
-    scaled = inner * _along(scale, inner)
-    along = jnp.mean(scaled * normalized, axis=-1, keepdims=True)
-    return rate * (scaled - jnp.mean(scaled, axis=-1, keepdims=True) - normalized * along), inner
+def _row_derivatives(saved: _Saved, gradient: Array) -> tuple[Array, Array]:
+    """From the derivative by the output: those by x and by u = z * scale + offset, which ELU is taken of.
+
+    With g the derivative by z: that by x is (g - mean(g) - z mean(g z)) / std.
+    """
+    by_u = gradient * jnp.minimum(saved.output + 1.0, 1.0)  # the slope of ELU is exp(u) = output + 1 below zero, else 1
+    by_z = by_u * _along(saved.scale, by_u)
+    along = jnp.mean(by_z * saved.normalized, axis=-1, keepdims=True)
+    return saved.rate * (by_z - jnp.mean(by_z, axis=-1, keepdims=True) - saved.normalized * along), by_u
 
 
-def _derivative(saved: tuple[Array, ...], gradient: Array) -> tuple[Array, Array, Array]:
-    to_x, inner = _row_derivatives(saved, gradient)
-    batch = tuple(range(inner.ndim - 1))
-    return to_x, jnp.sum(inner * saved[0], axis=batch), jnp.sum(inner, axis=batch)
+def _derivative(saved: _Saved, gradient: Array) -> tuple[Array, Array, Array]:
+    by_x, by_u = _row_derivatives(saved, gradient)
+    batch = tuple(range(by_u.ndim - 1))
+    return by_x, jnp.sum(by_u * saved.normalized, axis=batch), jnp.sum(by_u, axis=batch)
 
 
 _normalized_elu.defvjp(_normalize_and_activate, _derivative)

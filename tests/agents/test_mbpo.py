@@ -17,7 +17,7 @@ from mbdpg.interfaces import Batch, EnvSpec, Statistics, UserError, phase_of
 O, A, BATCH = 3, 2, 8
 ENV = EnvSpec("made-in-code", observation_size=O, action_size=A, episode_limit=None, reference_return=None)
 SMALL: dict[str, Any] = {
-    **{"width": 8, "batch_size": BATCH, "real_share": 0.25, "members": 3, "elites": 2, "model_width": 8},
+    **{"width": 8, "batch_size": BATCH, "real_share": 0.25, "members": 3, "elites": 2, "dynamics_width": 8},
     **{"fit_batch_size": 4, "rollouts_per_step": 2, "imagine_every": 5, "retained_steps": 20},
 }
 

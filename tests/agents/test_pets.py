@@ -16,7 +16,7 @@ ENV = EnvSpec("Ant-v5", observation_size=2, action_size=1, episode_limit=None, r
 
 
 def agent(**settings: float | str) -> PETS:
-    small = {"members": 3, "model_width": 8, "fit_batch_size": 4, "population": 8, "plan_elites": 2}
+    small = {"members": 3, "dynamics_width": 8, "fit_batch_size": 4, "population": 8, "plan_elites": 2}
     return PETS(Config(**(small | {"horizon": 3} | settings)), ENV)
 
 
@@ -72,7 +72,7 @@ def test_a_fit_moves_every_parameter_and_nothing_but_the_ensemble(differences: C
 def test_it_brings_a_point_to_where_the_reward_is() -> None:
     """One step of a point that an action moves by a half, paid for its nearness to 0."""
     env = EnvSpec("point", observation_size=1, action_size=1, episode_limit=None, reference_return=None)
-    config = Config(members=2, model_width=16, fit_batch_size=32, horizon=2, population=60, plan_elites=6)
+    config = Config(members=2, dynamics_width=16, fit_batch_size=32, horizon=2, population=60, plan_elites=6)
     rng, replay, learner = np.random.default_rng(0), Replay(1, 1), Learner(PETS(config, env), [0])
     for step in range(600):
         place, action = rng.uniform(-1, 1, 1), rng.uniform(-1, 1, 1)

@@ -27,15 +27,15 @@ AGENTS: dict[str, Agent] = {
     # Half of its steps are real: imagination has the policy's actions alone, and probes ask for others too.
     "mbpo": mbpo.MBPO(
         mbpo.Config(
-            **{**NETWORKS, **SOFT, "real_share": 0.5, "members": 3, "elites": 2, "model_width": 16},
-            **{"model_learning_rate": 3e-3, "fit_batch_size": BATCH, "rollouts_per_step": 32, "imagine_every": 1},
+            **{**NETWORKS, **SOFT, "real_share": 0.5, "members": 3, "elites": 2, "dynamics_width": 16},
+            **{"dynamics_learning_rate": 3e-3, "fit_batch_size": BATCH, "rollouts_per_step": 32, "imagine_every": 1},
             retained_steps=20,
         ),
         ENV,
     ),
     "pets": pets.PETS(
         pets.Config(
-            **{"members": 3, "model_width": 16, "model_learning_rate": 3e-3, "fit_batch_size": BATCH},
+            **{"members": 3, "dynamics_width": 16, "dynamics_learning_rate": 3e-3, "fit_batch_size": BATCH},
             **{"discount": GAMMA, "horizon": 6, "population": 200, "plan_elites": 20, "iterations": 20},
         ),
         ENV,

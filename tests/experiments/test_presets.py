@@ -124,8 +124,8 @@ def test_the_rivals_have_their_authors_sizes_and_settings() -> None:
     own |= {
         "mbpo": soft
         | {"random_steps": 5000, "updates_per_step": 20, "rollouts_per_step": 400, "imagine_every": 250}
-        | {"retained_steps": 1000, "real_share": 0.05, "members": 7, "elites": 5, "model_width": 200}
-        | {"model_learning_rate": 1e-3, "fit_batch_size": 256, "rollout_length": 1, "final_rollout_length": 1}
+        | {"retained_steps": 1000, "real_share": 0.05, "members": 7, "elites": 5, "dynamics_width": 200}
+        | {"dynamics_learning_rate": 1e-3, "fit_batch_size": 256, "rollout_length": 1, "final_rollout_length": 1}
     }
     for algorithm in ("td3", "sac", "mbpo"):
         config = agent_config(algorithm, "paper")
@@ -136,7 +136,7 @@ def test_the_rivals_have_their_authors_sizes_and_settings() -> None:
 def test_pets_has_its_authors_settings() -> None:
     # Chua et al. 2018 and kchua/handful-of-trials, HalfCheetah.
     expected = {"horizon": 30, "population": 500, "plan_elites": 50, "iterations": 5, "smoothing": 0.1, "members": 5}
-    expected |= {"model_width": 200, "model_learning_rate": 1e-3, "random_steps": 1000, "termination": "learned"}
+    expected |= {"dynamics_width": 200, "dynamics_learning_rate": 1e-3, "random_steps": 1000, "termination": "learned"}
     config = agent_config("pets", "paper", "HalfCheetah-v5")
     assert {name: getattr(config, name) for name in expected} == expected
     assert config.particles * config.members == 20

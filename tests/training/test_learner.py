@@ -29,12 +29,12 @@ def make_sac(**settings: Any) -> Agent:
 
 
 def make_mbpo(**settings: Any) -> Agent:
-    small = {"members": 2, "elites": 1, "model_width": 4, "fit_batch_size": 3, "rollouts_per_step": 1}
+    small = {"members": 2, "elites": 1, "dynamics_width": 4, "fit_batch_size": 3, "rollouts_per_step": 1}
     return mbpo.MBPO(mbpo.Config(**(TINY | small | {"imagine_every": 4, "retained_steps": 8} | settings)), SPEC)
 
 
 def make_pets(**settings: Any) -> Agent:
-    small = {"members": 2, "model_width": 4, "fit_batch_size": 3, "horizon": 2, "population": 4}
+    small = {"members": 2, "dynamics_width": 4, "fit_batch_size": 3, "horizon": 2, "population": 4}
     return pets.PETS(pets.Config(**(small | {"plan_elites": 2} | settings)), SPEC)
 
 
