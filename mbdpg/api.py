@@ -89,7 +89,8 @@ def resume(
         UserError: not a run, or damaged beyond its checkpoints.
     """
     on_update = _only_evaluations(on_evaluation)
-    resuming.resume([Path(path)], make_env=_maker(env), steps=steps, watch=lambda *_: on_update)
+    make_env = None if env is None else _maker(env)
+    resuming.resume([Path(path)], make_env=make_env, steps=steps, watch=lambda *_: on_update)
 
 
 def load_policy(path: str | Path, *, best: bool = False) -> NumpyPolicy | PlanningPolicy:
@@ -131,7 +132,7 @@ def evaluate(env: Env, policy: Callable[[np.ndarray], np.ndarray], *, episodes: 
 
 def _maker(env: Any) -> Callable[[], Environment] | None:
     """A function that makes the environment and wraps it; None for a registered one."""
-    if env is None or isinstance(env, str):
+    if isinstance(env, str):
         return None
     given = type(env).__name__
     require(callable(env), f"env is {given}, expected a Gymnasium id or a function that makes an environment")

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from mbdpg.cli.flags import EnvArgument, parse, program
+from mbdpg.cli.flags import EnvArgument, imports, parse, program
 from mbdpg.experiments import expert
 from mbdpg.experiments.compilations import keep_compilations
 from mbdpg.experiments.config import EnvOptions
@@ -66,13 +66,13 @@ def make_demonstrations(flags: Demonstrate, args: Sequence[str], *, then: str = 
     config = expert.config_of(flags.env, flags.steps, flags.env_options)
     folder = flags.out.parent / f"{flags.out.stem}-expert"
     run = flags.expert or folder / f"seed-{flags.seed}"
-    quoted = shlex.quote(str(run))
+    resume = shlex.join([program(), "resume", str(run), *imports(flags.env_options)])
     if flags.expert:
         RunFolder.open(run)
     require(
         flags.expert is not None or not run.exists(),
-        f"{run} has an expert already: take it with --expert {quoted}, after more training if it needs that "
-        f"({program()} resume {quoted} --steps N), or choose another --out",
+        f"{run} has an expert already: take it with --expert {shlex.quote(str(run))}, after more training if it needs "
+        f"that ({resume} --steps N), or choose another --out",
     )
     require_place(flags.out, "--out")
     if flags.expert is None:
@@ -80,7 +80,7 @@ def make_demonstrations(flags: Demonstrate, args: Sequence[str], *, then: str = 
             with RunDisplay(flags.steps) as display:
                 train(config, seeds=[flags.seed], out=folder, on_update=display, should_stop=stop)
             again = shlex.join([*args, "--expert", str(run)])
-            stop.exit_if_asked(f"{program()} resume {quoted}, then {program()} demonstrate {again}{then}")
+            stop.exit_if_asked(f"{resume}, then {program()} demonstrate {again}{then}")
     found = expert.record_from(
         run,
         flags.env,

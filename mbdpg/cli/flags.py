@@ -109,6 +109,11 @@ def as_flags(settings: Any) -> list[str]:
     return [word for name, value in values.items() if value != defaults[name] for word in as_flag(name, value)]
 
 
+def imports(options: EnvOptions) -> list[str]:
+    """The flag without which no command makes the environment of an id that names a module."""
+    return ["--allow-import"] if options.allow_import else []
+
+
 def _plain(text: str) -> str:
     """Tyro's boxed explanation as one line, without the box's title."""
     without_colors = re.sub(r"\x1b\[[0-9;]*m", "", text)

@@ -44,7 +44,7 @@ def resume(args: list[str]) -> None:
 
             def display(going: Sequence[Path], config: RunConfig, env_steps: int) -> RunDisplay:
                 displays.close()  # of those before
-                if env_steps >= config.schedule.steps:
+                if flags.steps is None and env_steps >= config.schedule.steps:
                     for run in going:
                         print(f"{run} has its {env_steps:,} steps already; --steps makes it longer")
                 elif len(going) < len(runs):

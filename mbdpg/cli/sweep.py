@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from mbdpg import envs
 from mbdpg.cli.flags import default_folder, program, run_flags
 from mbdpg.cli.places import Places, engine_of, made, say
 from mbdpg.experiments import presets
@@ -48,7 +49,7 @@ def sweep(args: list[str]) -> None:
     """Run the verb."""
     flags: Any = run_flags("sweep", "Search for the settings that learn best, with Optuna.", SweepOptions, args)
     run = flags.run
-    config = RunConfig(flags.env, flags.agent, flags.schedule, flags.env_options)
+    config = RunConfig(envs.current_id(flags.env), flags.agent, flags.schedule, flags.env_options)
     require(run.trials >= 1, f"--trials is {run.trials}, expected at least 1")
     require(len(run.search) > 0, "nothing is searched; say what with --search, for example --search horizon=1:20")
     checked_seeds(run.seeds)

@@ -10,8 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from mbdpg import envs
 from mbdpg.cli.demonstrate import Demonstrate, make_demonstrations
-from mbdpg.cli.flags import as_flags, default_folder, program, run_flags
+from mbdpg.cli.flags import as_flags, default_folder, imports, program, run_flags
 from mbdpg.experiments import presets, run
 from mbdpg.experiments.compilations import keep_compilations
 from mbdpg.experiments.config import Algorithm, RunConfig
@@ -47,7 +48,7 @@ def train(args: list[str]) -> None:
     flags = run_flags("train", "Learn a policy for a Gymnasium environment.", RunOptions, args)
     checked_seeds(flags.run.seeds)  # before an expert is trained for them
     keep_compilations()
-    config = RunConfig(flags.env, flags.agent, flags.schedule, flags.env_options)
+    config = RunConfig(envs.current_id(flags.env), flags.agent, flags.schedule, flags.env_options)
     out = flags.run.out or default_folder("runs", config)
     if flags.run.demonstrations == "expert":
         run.check_task(config)
@@ -63,7 +64,7 @@ def train(args: list[str]) -> None:
     with Stop() as stop:
         with RunDisplay(config.schedule.steps) as display:
             runs = run.train(config, seeds=flags.run.seeds, out=out, on_update=display, should_stop=stop)
-        stop.exit_if_asked(shlex.join([program(), "resume", str(out), *_imports(config)]))
+        stop.exit_if_asked(shlex.join([program(), "resume", str(out), *imports(config.env_options)]))
     finish(runs)
 
 
@@ -83,9 +84,4 @@ def finish(runs: Sequence[Path]) -> None:
     draw_curves(groups, folder / "learning-curve.png", title=config.env)
     print(f"done: {folder}, learning curve in {folder / 'learning-curve.png'}")
     film = ["--episodes", "10", "--video", str(folder / "policy.mp4")]
-    print("next:", shlex.join([program(), "evaluate", str(first), *film, *_imports(config)]))
-
-
-def _imports(config: RunConfig) -> list[str]:
-    """The flag without which no command makes the environment of an id that names a module."""
-    return ["--allow-import"] if config.env_options.allow_import else []
+    print("next:", shlex.join([program(), "evaluate", str(first), *film, *imports(config.env_options)]))

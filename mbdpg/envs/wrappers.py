@@ -56,9 +56,9 @@ class GymnasiumEnvironment:
             action: shape (action_size,), in [-1, 1]; what lies beyond is clipped.
 
         Raises:
-            ValueError: the action has another shape, a NaN or an infinity; the environment was not stepped.
             NonFiniteError: the observation or the reward has a NaN or, as float32, an infinity.
-            UserError: the observation has not the shape that the environment promised.
+            UserError: the action has another shape, a NaN or an infinity, and the environment was not stepped; or the
+                observation has not the shape that the environment promised.
         """
         observation, reward, terminated, truncated, _ = self._env.step(self._real_action(action))
         observation = self._checked(observation)
@@ -97,11 +97,11 @@ class GymnasiumEnvironment:
         """Maps [-1, 1] to the real bounds in float64, then casts to the dtype of the action space."""
         scaled = np.array(action, dtype=np.float64)
         if scaled.shape != self._action_shape:
-            raise UserError(
-                f"{self.spec.id} takes actions of shape {self._action_shape}, not {scaled.shape}; mend the policy"
-            )
+            shapes = f"the shape {scaled.shape}, expected {self._action_shape}"
+            raise UserError(f"{self.spec.id} was not stepped: the policy's action has {shapes}")
         if np.count_nonzero(np.isfinite(scaled)) != scaled.size:  # half the time of isfinite().all()
-            raise UserError(f"{self.spec.id} was not stepped: action {_first_non_finite(scaled)}; mend the policy")
+            found = f"the policy's action has {_first_non_finite(scaled)}, expected finite numbers"
+            raise UserError(f"{self.spec.id} was not stepped: {found}")
         np.minimum(scaled, self._one, out=scaled)
         np.maximum(scaled, self._minus_one, out=scaled)
         scaled *= self._half_range

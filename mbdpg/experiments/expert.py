@@ -58,17 +58,19 @@ def record_from(
         UserError: there was no success, it is no run, or its policy is for another environment.
     """
     RunFolder.open(run)
-    evaluated = read_metrics(run, "eval")
-    cost = sum(evaluated[name][-1] for name in ("env_steps", "expert_env_steps") if evaluated["env_steps"])
     made = RunConfig(env, env_options=env_options).make_env()
     try:
         policy = load_policy(run, best=True, spec=made.spec)
+        evaluated = read_metrics(run, "eval")
+        # Of a run that still goes on, the last row may have its time alone.
+        rows = zip(evaluated["env_steps"], evaluated["expert_env_steps"], strict=True)
+        steps, taught = [row for row in rows if row[1] is not None][-1]
         return record(
             made,
             policy,
             episodes=episodes,
             success_return=success_return,
-            expert_env_steps=cost,
+            expert_env_steps=steps + taught,
             seed=seed,
         )
     finally:

@@ -70,7 +70,8 @@ class _Saved(NamedTuple):
     @property
     def place(self) -> str:
         """The same for runs that can go on at once."""
-        facts = {name: self.checkpoint.facts.get(name) for name in ("updates", "recorded", "expert_env_steps")}
+        names = ("updates", "recorded", "ended", "expert_env_steps")
+        facts = {name: self.checkpoint.facts.get(name) for name in names}
         return json.dumps([self.config.to_json(), self.checkpoint.env_steps, facts], sort_keys=True)
 
 

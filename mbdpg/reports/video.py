@@ -26,6 +26,7 @@ class VideoWriter:
         # Otherwise ffmpeg is started by a fork, which may deadlock beside JAX's threads.
         os.environ.setdefault("IMAGEIO_FFMPEG_NO_PREVENT_SIGINT", "1")
         try:
+            path.open("ab").close()  # ffmpeg writes the file itself, where it lies
             self._writer: Any = imageio.get_writer(
                 path, fps=frames_per_second, macro_block_size=2, ffmpeg_log_level="error"
             )

@@ -92,7 +92,7 @@ def require_place(path: Path, flag: str, *, suffix: str = "") -> None:
     Raises:
         UserError: it has another ending, it is a folder, or it cannot be written.
     """
-    require(path.name.endswith(suffix), f"{flag} is {path}, expected a name that ends in {suffix}")
+    require(not suffix or path.suffix == suffix, f"{flag} is {path}, expected a name that ends in {suffix}")
     require(not os.path.isdir(path), f"{flag} is {path}, a folder; expected a file's name")
     probe = path.with_name(TEMPORARY + path.name)
     try:

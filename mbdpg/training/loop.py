@@ -91,7 +91,7 @@ class Training:
         self._expert_env_steps = expert_env_steps
         self._updates = {phase.name: 0 for phase in learner.agent.phases}
         self._recorded = -1
-        self._ends_here = False
+        self._ended = -1
         self._saved: tuple[int, ...] = ()
         self._sums: list[dict[str, list[float]]] = [{} for _ in collectors]
         self._seconds = {"acting": 0.0, "evaluating": 0.0} | {phase.name: 0.0 for phase in learner.agent.phases}
@@ -107,12 +107,12 @@ class Training:
         with contextlib.suppress(StoppedError):
             while self._learn(should_stop):
                 policies, stds = self.learner.behaviors()
-                if self._recorded < self.env_steps or self._ends_here:
+                if self._recorded < self.env_steps or self._ended < self.env_steps == self.schedule.steps:
                     on_update(self._record(stds, should_stop))
                 if self.env_steps >= self.schedule.steps or should_stop():
                     break
                 self._collect(policies, stds)  # Algorithm 1, line 5
-        if self._saved != (self.env_steps, *self._updates.values()) and not self._ends_here:
+        if self._saved != (self.env_steps, *self._updates.values()):
             self.save()
 
     def save(self) -> None:
@@ -127,6 +127,7 @@ class Training:
             facts |= {
                 "steps": self.schedule.steps,
                 "recorded": self._recorded,
+                "ended": self._ended,
                 "expert_env_steps": self._expert_env_steps,
                 "demonstrated": collector.replay.demonstrated,
                 "clock": self._clock(index),
@@ -140,8 +141,7 @@ class Training:
         self._updates = {name: int(facts[0]["updates"][name]) for name in self._updates}
         require(min(self._updates.values()) >= 0, "the checkpoint counts fewer than no updates")
         self._recorded = facts[0]["recorded"]
-        # What was to go on, and is now to end where it stands, has not recorded the end of a run yet.
-        self._ends_here = self.env_steps == self.schedule.steps < facts[0]["steps"]
+        self._ended = facts[0]["ended"]
         self._expert_env_steps = facts[0]["expert_env_steps"]
         self._sums = [dict(fact["sums"]) for fact in facts]
         self._before = [{name: float(fact["clock"][f"time/{name}"]) for name in self._before[0]} for fact in facts]
@@ -149,11 +149,16 @@ class Training:
             collector.restore(fact["collector"])
 
     def _record(self, stds: np.ndarray, should_stop: Callable[[], bool]) -> Update:
-        """Evaluate, log and save, each if it is due at this step."""
+        """Evaluate, log and save, each if it is due at this step.
+
+        A run that was to go on, and is now to end where it stands, comes here a second time.
+        """
         schedule = self.schedule
         evaluation = self._evaluate(should_stop) if self._due(schedule.evaluate_every) else None
         log, save = self._due(schedule.log_every), self._due(schedule.checkpoint_every)
-        self._recorded, self._ends_here = self.env_steps, False
+        self._recorded = self.env_steps
+        if self.env_steps == schedule.steps:
+            self._ended = self.env_steps
         if log:
             self._log(stds)
         if save:

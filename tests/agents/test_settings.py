@@ -3,12 +3,13 @@
 import ast
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import mbdpg
 from mbdpg.agents import mbdpg as model_based, mbpo, pets, sac, td3
-from mbdpg.interfaces import UserError
+from mbdpg.interfaces import UserError, as_flag
 from mbdpg.training.loop import Schedule
 
 PACKAGE = Path(mbdpg.__file__).parent
@@ -62,6 +63,14 @@ IMPOSSIBLE = [
 def test_an_impossible_setting_is_refused_by_its_flags_name(config: type, name: str, value: float) -> None:
     with pytest.raises(UserError, match="--" + name.replace("_", "-")):
         config(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "typed"),
+    [("plain", False, ["--no-plain"]), ("plain", True, ["--plain"]), ("batch_size", 3, ["--batch-size", "3"])],
+)
+def test_a_setting_is_said_as_train_takes_it(name: str, value: Any, typed: list[str]) -> None:
+    assert as_flag(name, value) == typed
 
 
 @pytest.mark.parametrize("values", [{"steps": 0}, {"steps": 120}, {"cycle": 0}, {"evaluation_episodes": 0}])

@@ -138,11 +138,6 @@ def test_a_sweep_goes_on_where_it_was_and_says_what_was_best(here: None, tmp_pat
         begin(tmp_path, searches=SEARCHES[:1])
 
 
-def test_what_was_best_is_said_in_flags_that_train_takes() -> None:
-    flags = [module._as_flag(*setting) for setting in (("plain", False), ("plain", True), ("batch_size", 3))]
-    assert flags == ["--no-plain", "--plain", "--batch-size 3"]
-
-
 def test_a_score_leaves_out_the_evaluation_before_anything_was_done(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "returns", lambda training: {0: -1000.0, 20: 1.0, 40: 3.0})
     assert module.score(Training(CONFIG, (0,), Path("trial"))) == 2.0

@@ -190,22 +190,30 @@ def test_a_finished_run_that_is_resumed_adds_nothing(whole: Any, toy: Any) -> No
     assert bytes_of(recorder.checkpoints[-1][1]) == bytes_of(arrays)
 
 
+def resumed(toy: Any, recorder: Any, steps: int, stop: Callable[[], bool] = never) -> Any:
+    """The recorder of what goes on from another's last checkpoint, to as many steps."""
+    env_steps, arrays, facts, columns = recorder.checkpoints[-1]
+    schedule = dataclasses.replace(toy.toy_training([0])[0].schedule, steps=steps)
+    training, (recorder,) = toy.toy_training([0], replay=Replay.from_columns(columns), schedule=schedule)
+    training.restore(env_steps, [arrays], [facts])
+    run(training, stop)
+    return recorder
+
+
 @pytest.mark.parametrize(("at", "kinds"), [(15, ["eval", "train"]), (10, ["eval"])])
-def test_a_run_that_is_to_end_where_it_stands_is_evaluated_there(toy: Any, at: int, kinds: list[str]) -> None:
+def test_a_run_that_is_to_end_where_it_stands_is_evaluated_there_once(toy: Any, at: int, kinds: list[str]) -> None:
     """It was said to have its steps already, and its last policy was never evaluated or saved."""
-    training, (recorder,) = toy.toy_training([0])
+    training, (stopped,) = toy.toy_training([0])
     seen: list[int] = []
     training.run(lambda update: seen.append(update.env_steps), lambda: at in seen)
-    env_steps, arrays, facts, columns = recorder.checkpoints[-1]
-    assert env_steps == at and facts["recorded"] == at
-    schedule = dataclasses.replace(training.schedule, steps=at)
-    for stop in True, False:  # asked to stop before it is evaluated, it is as it was
-        training, (recorder,) = toy.toy_training([0], replay=Replay.from_columns(columns), schedule=schedule)
-        training.restore(env_steps, [arrays], [facts])
-        run(training, lambda stop=stop: stop)
-        assert bool(recorder.checkpoints) != stop
-    assert [row["kind"] for row in recorder.rows] == kinds and len(recorder.policies) == 1
-    assert recorder.checkpoints[-1][2]["steps"] == at
+    assert stopped.checkpoints[-1][0] == at
+    asked = resumed(toy, stopped, at, lambda: True)  # before it is evaluated
+    assert asked.rows == []
+    ended = resumed(toy, asked, at)
+    assert [row["kind"] for row in ended.rows] == kinds and len(ended.policies) == 1
+    longer = resumed(toy, ended, 60, lambda: True)  # before it goes on
+    again = resumed(toy, longer, at)
+    assert again.rows == [] and again.checkpoints[-1][2]["steps"] == at
 
 
 def counted(
