@@ -84,8 +84,14 @@ TASKS: dict[str, dict[str, dict[str, dict[str, Any]]]] = {
             "BipedalWalker": {"grounding_tolerance": 1000.0},  # 47, 49, 61: real returns cut short unlearn its gait
             "HalfCheetah": {"planning": "stochastic", "discount": 0.98},  # 39, 41: late it exploits the mean's errors
             # 50: with 0.99 it leaps and falls at step 170; 69, 71: the lesser critic fears speeds that it has not seen
-            # 74: older steps, of policies that earned less, hold it back
-            "Hopper": {"planning": "stochastic", "discount": 0.995, "actor_value": "mean", "recent_steps": 10_000},
+            # 74, 77: older steps, of policies that earned less, hold it back, but for falls, which else it forgets
+            "Hopper": {
+                "planning": "stochastic",
+                "discount": 0.995,
+                "actor_value": "mean",
+                "recent_steps": 10_000,
+                "recent_terminations": 20,
+            },
             # 51, 53, 55: imagined rewards are too hopeful to land; with real returns over 8 steps it lands and forgets
             # 60: the lesser critic fears the ground, where little is seen, and hovers
             "LunarLanderContinuous": {
