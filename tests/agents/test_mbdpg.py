@@ -546,3 +546,9 @@ def test_returns_of_twenty_steps_leave_out_what_a_time_limit_cuts() -> None:
     )
     rewards = np.asarray(imagined.rewards * imagined.survival()[:-1] * state().return_scale)
     np.testing.assert_allclose(found["dynamics/return_imagined"], np.mean(powers @ rewards[:, :2]), rtol=1e-4)
+
+
+def test_actor_and_critics_learn_from_the_newest_steps_and_falls_and_the_dynamics_from_all() -> None:
+    one = agent((("recent_steps", 100), ("recent_terminations", 7)))
+    recent = {phase.name: (phase.sampling.newest, phase.sampling.terminations) for phase in one.phases}
+    assert recent == {"cloning": (0, 0), "fitting": (0, 0), "improving": (100, 7), "grounding": (100, 7)}
