@@ -10,7 +10,6 @@ import imageio
 import numpy as np
 
 from mbdpg.interfaces import UserError
-from mbdpg.storage.files import require_place
 
 
 class VideoWriter:
@@ -22,11 +21,13 @@ class VideoWriter:
         Raises:
             UserError: its ending is not .mp4, or it cannot be written.
         """
-        require_place(path, "--video", suffix=".mp4")
+        if path.suffix != ".mp4":
+            raise UserError(f"the video is to be called {path.name!r}; expected a name that ends in .mp4")
         # Otherwise ffmpeg is started by a fork, which may deadlock beside JAX's threads.
         os.environ.setdefault("IMAGEIO_FFMPEG_NO_PREVENT_SIGINT", "1")
         try:
-            path.open("ab").close()  # ffmpeg writes the file itself, where it lies
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.open("ab").close()
             self._writer: Any = imageio.get_writer(
                 path, fps=frames_per_second, macro_block_size=2, ffmpeg_log_level="error"
             )
