@@ -6,6 +6,7 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
+import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from mbdpg.interfaces import Metrics
@@ -73,11 +74,20 @@ def likeness(
 
 
 def critic_loss(
-    values: Float[Array, "critic *batch"], targets: Float[Array, "*batch"], weights: Float[Array, "*batch"]
+    values: Float[Array, "critic *batch"],
+    targets: Float[Array, "*batch"],
+    weights: Float[Array, "*batch"],
+    *,
+    huber_delta: float = 0.0,
 ) -> Float[Array, ""]:
-    """Weighted mean square error of every critic to one shared target (Eq. 14, 16), summed over the critics."""
-    errors = jnp.square(values - jax.lax.stop_gradient(targets)[None])
-    return jnp.sum(errors * weights[None]) / jnp.maximum(jnp.sum(weights), 1.0)
+    """Weighted mean square error of every critic to one shared target (Eq. 14, 16), summed over the critics.
+
+    A `huber_delta` above 0 is the size of error beyond which the square goes on as its tangent (Huber 1964), so that
+    single large errors, those before falls, do not outweigh all others.
+    """
+    errors = values - jax.lax.stop_gradient(targets)[None]
+    losses = 2.0 * optax.losses.huber_loss(errors, delta=huber_delta) if huber_delta else jnp.square(errors)
+    return jnp.sum(losses * weights[None]) / jnp.maximum(jnp.sum(weights), 1.0)
 
 
 def policy_objective(

@@ -314,6 +314,13 @@ def test_the_actor_climbs_the_value_that_it_is_told_to(actor_value: str, reduced
     np.testing.assert_allclose(metrics["actor/objective"], np.mean(reduced(values, axis=0)), rtol=1e-5)
 
 
+@pytest.mark.parametrize(("phase", "loss"), [("improve", "critic/loss"), ("ground", "critic/grounding_loss")])
+def test_large_errors_count_by_their_size_in_both_updates_of_the_critics(phase: str, loss: str) -> None:
+    """Halving a delta that all errors exceed halves the loss."""
+    found = [float(update(phase, (("huber_delta", d),))(state(), BATCHES[phase])[1][loss]) for d in (2e-5, 1e-5)]
+    assert found[0] == pytest.approx(2 * found[1], rel=1e-2)
+
+
 def test_targets_wait_for_the_third_update_where_c_is_3(differences: Callable[..., set[str]]) -> None:
     step = update("improve", tuple(PAPER.items()))
     states = [state()]

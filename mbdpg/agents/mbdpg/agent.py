@@ -128,8 +128,8 @@ class MBDPG:
         weights = imagined.survival()[:-1] * start.weight[None]
 
         def loss(values: Array) -> Array:
-            total = objectives.critic_loss(values[:, 0], targets[0], jnp.ones_like(targets[0]))
-            return total + c.imagined_weight * objectives.critic_loss(values[:, 1:-1], targets[1:], weights)
+            total = self._critic_loss(values[:, 0], targets[0], jnp.ones_like(targets[0]))
+            return total + c.imagined_weight * self._critic_loss(values[:, 1:-1], targets[1:], weights)
 
         values = slopes.output.reshape(-1, c.horizon + 2, *start.weight.shape)
         critic_loss, errors = jax.value_and_grad(loss)(values)
@@ -162,7 +162,7 @@ class MBDPG:
         targets = objectives.expanded_values(rewards, continues, values, self.config.discount, trace)
 
         def loss(critics: Critics) -> Array:
-            return objectives.critic_loss(critics(steps.observation, steps.action), targets, steps.valid)
+            return self._critic_loss(critics(steps.observation, steps.action), targets, steps.valid)
 
         value, gradient = jax.value_and_grad(loss)(state.critics)
         following = jnp.maximum(jnp.sum(after.valid), 1.0)  # steps that might be followed
@@ -173,6 +173,9 @@ class MBDPG:
         """Clipped value of the target policy's action, smoothed as in TD3."""
         action = objectives.smoothed_action(state.target_actor(observation), self.config.target_noise, 0.5, key=key)
         return objectives.clipped_value(state.target_critics(observation, action))
+
+    def _critic_loss(self, values: Array, targets: Array, weights: Array) -> Array:
+        return objectives.critic_loss(values, targets, weights, huber_delta=self.config.huber_delta)
 
     def _step_critics(self, state: State, gradient: Critics) -> State:
         """Step the critics, then let the targets follow every C-th time."""

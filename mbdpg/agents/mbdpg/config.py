@@ -53,6 +53,8 @@ class Config:
     """Lambda of the value expansion: 1 is Eq. 16, 0 one-step targets, in between longer expansions count less."""
     imagined_weight: float = 0.5
     """Weight of the critic's loss on imagined states beside that on real transitions."""
+    huber_delta: float = 0.0
+    """Critics' errors beyond it, in root mean squares of reward, count by size instead of square; 0: all by square."""
     imagination_ratio: float = 0.0
     """Share of imagination that starts from the imagination buffer instead of the environment's."""
     imagination_depth: int = 20
