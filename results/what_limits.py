@@ -11,7 +11,8 @@ dynamics and steps that are there: if they come to more than the run's own, thos
 `objective` takes apart what the actor climbs: the value of its first action, returns over so many imagined steps and a
 value after them, by the lesser of both critics and by their mean, and the penalty of saturated actions. What real
 episodes pay a small step back and on along each gradient tells which of them mislead: where learning has come to rest
-they add up to nothing, and those along which real returns fall hold the others back.
+they add up to nothing, and those along which real returns fall hold the others back. A batch's gradient that is much
+larger than the mean of many is noise of the batch; one that is not is what the critics believe at the moment.
 `model` trains the dynamics afresh on the first steps and tests them on those that came later, which is what they are
 needed for: episodes of policies that they have not seen. Other settings of the agent's than the run's are `mbdpg
 train`'s flags.
@@ -149,11 +150,13 @@ def objective(options: argparse.Namespace) -> None:
         policy = NumpyPolicy(policy_arrays(moved, state.normalizer))
         return float(np.mean(evaluate(env, policy, range(1000, 1005)).returns))
 
-    entries = sum(leaf.size for leaf in jax.tree.leaves(actor))
-    print(f"return {played(actor, 0.0):.0f}; a root mean square step of {STEP:g} back and on along the gradient of")
+    noisy, entries = summed[0], sum(leaf.size for leaf in jax.tree.leaves(actor))
+    print(f"return {played(actor, 0.0):.0f}; a root mean square step of {STEP:g} back and on along a part's gradient,")
+    print(f"and that gradient's norm from one batch and from {BATCHES}")
     for name, direction in gradients.items():
         step = STEP * entries**0.5 / float(optax.tree.norm(direction))
-        print(f"{name:22} {played(direction, -step):7.0f} {played(direction, step):7.0f}", flush=True)
+        norms = f"{optax.tree.norm(noisy[name]):8.3f} {optax.tree.norm(direction) / BATCHES:8.3f}"
+        print(f"{name:22} {played(direction, -step):7.0f} {played(direction, step):7.0f} {norms}", flush=True)
     env.close()
 
 

@@ -83,7 +83,7 @@ def critic_loss(
     """Weighted mean square error of every critic to one shared target (Eq. 14, 16), summed over the critics.
 
     A `huber_delta` above 0 is the size of error beyond which the square goes on as its tangent (Huber 1964), so that
-    single large errors, those before falls, do not outweigh all others.
+    a few large errors do not outweigh all others.
     """
     errors = values - jax.lax.stop_gradient(targets)[None]
     losses = 2.0 * optax.losses.huber_loss(errors, delta=huber_delta) if huber_delta else jnp.square(errors)

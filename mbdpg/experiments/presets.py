@@ -83,7 +83,7 @@ TASKS: dict[str, dict[str, dict[str, dict[str, Any]]]] = {
             "Ant": {"planning": "stochastic", "discount": 0.98, "exploration_std": 0.1},
             "BipedalWalker": {"grounding_tolerance": 1000.0},  # 47, 49, 61: real returns cut short unlearn its gait
             "HalfCheetah": {"planning": "stochastic", "discount": 0.98},  # 39, 41: late it exploits the mean's errors
-            # 50: with 0.99 it leaps and falls at step 170; 69, 71: the lesser critic fears speeds that it has not seen
+            # 50, 81: with 0.99 it leaps, or runs and falls; 69, 71: the lesser critic fears speeds that it has not seen
             # 74, 77: older steps, of policies that earned less, hold it back, but for falls, which else it forgets
             "Hopper": {
                 "planning": "stochastic",
