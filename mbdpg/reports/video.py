@@ -9,7 +9,7 @@ from typing import Any
 import imageio
 import numpy as np
 
-from mbdpg.interfaces import UserError
+from mbdpg.interfaces import UserError, require
 
 
 class VideoWriter:
@@ -21,13 +21,12 @@ class VideoWriter:
         Raises:
             UserError: its ending is not .mp4, or it cannot be written.
         """
-        if path.suffix != ".mp4":
-            raise UserError(f"the video is to be called {path.name!r}; expected a name that ends in .mp4")
+        require(path.suffix == ".mp4", f"--video is {path}, expected a name that ends in .mp4")
         # Otherwise ffmpeg is started by a fork, which may deadlock beside JAX's threads.
         os.environ.setdefault("IMAGEIO_FFMPEG_NO_PREVENT_SIGINT", "1")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.open("ab").close()
+            path.open("ab").close()  # ffmpeg writes the file itself, where it lies
             self._writer: Any = imageio.get_writer(
                 path, fps=frames_per_second, macro_block_size=2, ffmpeg_log_level="error"
             )
