@@ -316,9 +316,14 @@ def test_the_actor_climbs_the_value_that_it_is_told_to(actor_value: str, reduced
 
 @pytest.mark.parametrize(("phase", "loss"), [("improve", "critic/loss"), ("ground", "critic/grounding_loss")])
 def test_large_errors_count_by_their_size_in_both_updates_of_the_critics(phase: str, loss: str) -> None:
-    """Halving a delta that all errors exceed halves the loss."""
-    found = [float(update(phase, (("huber_delta", d),))(state(), BATCHES[phase])[1][loss]) for d in (2e-5, 1e-5)]
-    assert found[0] == pytest.approx(2 * found[1], rel=1e-2)
+    """With a delta that all errors exceed by far the share of progress is left out, and all of it at its end."""
+    end = eqx.tree_at(lambda x: x.progress, state(), jnp.ones(()))
+
+    def found(before: State, delta: float) -> float:
+        return float(update(phase, (("huber_delta", delta),))(before, BATCHES[phase])[1][loss])
+
+    assert found(end, 2e-5) == pytest.approx(2 * found(end, 1e-5), rel=1e-2)
+    assert found(state(), 1e-5) == pytest.approx((1 - float(state().progress)) * found(state(), 0.0), rel=1e-2)
 
 
 def test_targets_wait_for_the_third_update_where_c_is_3(differences: Callable[..., set[str]]) -> None:
@@ -463,12 +468,13 @@ def test_beta_and_the_spread_of_exploration_follow_the_return(
 ) -> None:
     moving = MBDPG(Config(**NETWORKS, **SHAPES, beta=3.0, final_beta=1.0), ENV)
     prepared = jax.jit(moving.prepare)(state(), statistics(progress))
-    assert float(prepared.beta) == pytest.approx(3 - 2 * progress)
+    metrics = update("improve", (("beta", 3.0),))(prepared, BATCHES["improve"])[1]
+    assert float(metrics["actor/beta"]) == pytest.approx(3 - 2 * progress)
     actor, normalizer, std = moving.behavior(prepared)
     assert actor is prepared.actor and normalizer is prepared.normalizer
     assert float(std) == pytest.approx(0.3 - 0.2 * progress)
     np.testing.assert_allclose(prepared.scales.delta, [0.2, 0.5, 0.5], rtol=1e-6)
-    assert {"normalizer", "scales", "return_scale", "beta", "std"} >= differences(state(), prepared)
+    assert {"normalizer", "scales", "return_scale", "progress"} >= differences(state(), prepared)
 
 
 def test_observation_entries_that_never_change_learn_finitely() -> None:

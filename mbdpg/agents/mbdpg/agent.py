@@ -51,10 +51,10 @@ class MBDPG:
         return initial_state(self.config, self.env, self._optimizers, key=key)
 
     def prepare(self, state: State, statistics: Statistics) -> State:
-        """Take over the replay's scales; beta and the behavior policy's spread follow the return (Section 4.3.2)."""
-        s, c, done = statistics, self.config, statistics.progress
+        """Take over the replay's scales and how far the return is."""
+        s = statistics
         return eqx.tree_at(
-            lambda x: (x.normalizer, x.scales, x.return_scale, x.beta, x.std),
+            lambda x: (x.normalizer, x.scales, x.return_scale, x.progress),
             state,
             (
                 Normalizer(s.observation_mean, s.observation_std),
@@ -64,8 +64,7 @@ class MBDPG:
                     s.terminal_reward_scale / s.return_scale,
                 ),
                 s.return_scale,
-                c.beta + (c.final_beta - c.beta) * done,
-                c.exploration_std + (c.final_exploration_std - c.exploration_std) * done,
+                s.progress,
             ),
         )
 
@@ -75,7 +74,8 @@ class MBDPG:
 
     def behavior(self, state: State) -> tuple[Policy, Normalizer, Array]:
         """The actor mu itself, so that the replay shows what the newest update does, and the spread of pi around it."""
-        return state.actor, state.normalizer, state.std
+        std = state.following(self.config.exploration_std, self.config.final_exploration_std)
+        return state.actor, state.normalizer, std
 
     def fit(self, state: State, batch: Batch, *, key: PRNGKeyArray) -> tuple[State, Metrics]:
         """One update of the dynamics (Eq. 11)."""
@@ -128,8 +128,8 @@ class MBDPG:
         weights = imagined.survival()[:-1] * start.weight[None]
 
         def loss(values: Array) -> Array:
-            total = self._critic_loss(values[:, 0], targets[0], jnp.ones_like(targets[0]))
-            return total + c.imagined_weight * self._critic_loss(values[:, 1:-1], targets[1:], weights)
+            total = self._critic_loss(state, values[:, 0], targets[0], jnp.ones_like(targets[0]))
+            return total + c.imagined_weight * self._critic_loss(state, values[:, 1:-1], targets[1:], weights)
 
         values = slopes.output.reshape(-1, c.horizon + 2, *start.weight.shape)
         critic_loss, errors = jax.value_and_grad(loss)(values)
@@ -144,7 +144,7 @@ class MBDPG:
             "critic/skipped": state.critic_optimizer.total_notfinite,
             "actor/grad_norm": optax.tree.norm(gradient),
             "actor/skipped": state.actor_optimizer.total_notfinite,
-            "actor/beta": state.beta,
+            "actor/beta": state.following(c.beta, c.final_beta),
         }
 
     def ground(self, state: State, batch: Batch, *, key: PRNGKeyArray) -> tuple[State, Metrics]:
@@ -162,7 +162,7 @@ class MBDPG:
         targets = objectives.expanded_values(rewards, continues, values, self.config.discount, trace)
 
         def loss(critics: Critics) -> Array:
-            return self._critic_loss(critics(steps.observation, steps.action), targets, steps.valid)
+            return self._critic_loss(state, critics(steps.observation, steps.action), targets, steps.valid)
 
         value, gradient = jax.value_and_grad(loss)(state.critics)
         following = jnp.maximum(jnp.sum(after.valid), 1.0)  # steps that might be followed
@@ -174,8 +174,9 @@ class MBDPG:
         action = objectives.smoothed_action(state.target_actor(observation), self.config.target_noise, 0.5, key=key)
         return objectives.clipped_value(state.target_critics(observation, action))
 
-    def _critic_loss(self, values: Array, targets: Array, weights: Array) -> Array:
-        return objectives.critic_loss(values, targets, weights, huber_delta=self.config.huber_delta)
+    def _critic_loss(self, state: State, values: Array, targets: Array, weights: Array) -> Array:
+        share = state.progress  # while it learns what a fall costs, large errors are what it has to learn
+        return objectives.critic_loss(values, targets, weights, huber_delta=self.config.huber_delta, huber_share=share)
 
     def _step_critics(self, state: State, gradient: Critics) -> State:
         """Step the critics, then let the targets follow every C-th time."""
@@ -246,8 +247,9 @@ class MBDPG:
         values = values if c.terminal_value else jnp.zeros_like(values)
         survival = imagined.survival()
         survival = jax.lax.stop_gradient(survival) if printed else survival
+        beta = state.following(c.beta, c.final_beta)
         objective = objectives.policy_objective(
-            imagined.rewards, values, survival, discount=c.discount, beta=state.beta, reward_weights=c.reward_weights
+            imagined.rewards, values, survival, discount=c.discount, beta=beta, reward_weights=c.reward_weights
         )
         count = jnp.maximum(jnp.sum(start.weight), 1.0)
         mean = jnp.sum(objective * start.weight) / count

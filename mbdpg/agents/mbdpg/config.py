@@ -54,7 +54,8 @@ class Config:
     imagined_weight: float = 0.5
     """Weight of the critic's loss on imagined states beside that on real transitions."""
     huber_delta: float = 0.0
-    """Critics' errors beyond it, in root mean squares of reward, count by size instead of square; 0: all by square."""
+    """With returns at the reference return, critics' errors beyond it (in root mean squares of reward) count by size
+    instead of square, before that a share of them; 0: all by square."""
     imagination_ratio: float = 0.0
     """Share of imagination that starts from the imagination buffer instead of the environment's."""
     imagination_depth: int = 20

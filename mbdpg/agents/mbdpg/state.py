@@ -42,9 +42,8 @@ class State(eqx.Module):
     """Reward that counts as one unit of value."""
     imagined: Ring
     """Of `Start`s: where imagination ended and may go on."""
-    beta: Float[Array, ""]
-    std: Float[Array, ""]
-    """Of the behavior policy."""
+    progress: Float[Array, ""]
+    """Of the return, from a random policy's (0) to the reference return (1)."""
     updates: Int[Array, ""]
     """Updates of the critics so far."""
 
@@ -65,6 +64,10 @@ class State(eqx.Module):
     def real_reward(self, window: Window) -> Float[Array, "*batch"]:
         """In units of value."""
         return window.reward * self.scales.reward + window.terminal_reward * self.scales.terminal_reward
+
+    def following(self, first: float, final: float) -> Float[Array, ""]:
+        """What goes from `first` to `final` with the return (Section 4.3.2)."""
+        return first + (final - first) * self.progress
 
 
 class Optimizers(NamedTuple):
@@ -107,7 +110,6 @@ def initial_state(config: Config, env: EnvSpec, optimizers: Optimizers, *, key: 
         scales=Scales(jnp.ones(o), one, one),
         return_scale=one,
         imagined=Ring.empty(slots, Start(jnp.zeros(o), dynamics.initial_memory(()), zero, zero)),
-        beta=jnp.asarray(config.beta, jnp.float32),
-        std=jnp.asarray(config.exploration_std, jnp.float32),
+        progress=zero,
         updates=jnp.zeros((), jnp.int32),
     )
