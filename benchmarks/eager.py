@@ -127,7 +127,8 @@ class Agent:
         values = self.values(*flat).reshape(2, horizon + 1, batch).min(0).values
         powers = discount ** torch.arange(horizon + 1)[:, None] * survival
         remaining = horizon - torch.arange(horizon)
-        objective = (remaining[:, None] * powers[:-1] * rewards).sum(0) * self.p["beta"] + (powers * values).sum(0)
+        beta = s["beta"] + (s["final_beta"] - s["beta"]) * self.p["progress"]
+        objective = beta * (remaining[:, None] * powers[:-1] * rewards).sum(0) + (powers * values).sum(0)
         objective = objective / (horizon + 1)
         count = weight.sum().clamp(min=1.0)
         mean = (objective * weight).sum() / count

@@ -43,7 +43,8 @@ def train(
         out: a folder that gets one run folder `seed-<seed>` per seed.
         demonstrations: a file that `mbdpg demonstrate` wrote.
         reference_return: undiscounted return at which the task is solved; exploration noise falls on the way there.
-            By default what Gymnasium or we know of an id; where nothing is known, noise stays as it is.
+            By default what Gymnasium or we know of an id; where nothing is known, noise stays as it is and
+            `huber_delta` does nothing.
         on_evaluation: called after every evaluation.
 
     Returns:

@@ -83,13 +83,14 @@ def critic_loss(
 ) -> Float[Array, ""]:
     """Weighted mean square error of every critic to one shared target (Eq. 14, 16), summed over the critics.
 
-    A `huber_delta` above 0 is the size of error beyond which, for a share of the loss, the square goes on as its
-    tangent (Huber 1964), so that a few large errors do not outweigh all others.
+    A `huber_delta` above 0 is the size of error beyond which the square goes on as its tangent (Huber 1964), so that
+    a few large errors do not outweigh all others; such is `huber_share` of the loss.
     """
     errors = values - jax.lax.stop_gradient(targets)[None]
     losses = jnp.square(errors)
     if huber_delta > 0.0:
-        losses += huber_share * (2.0 * optax.losses.huber_loss(errors, delta=huber_delta) - losses)
+        huber = 2.0 * optax.losses.huber_loss(errors, delta=huber_delta)
+        losses = (1.0 - huber_share) * losses + huber_share * huber
     return jnp.sum(losses * weights[None]) / jnp.maximum(jnp.sum(weights), 1.0)
 
 

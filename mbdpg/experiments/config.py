@@ -38,7 +38,8 @@ class EnvOptions:
     observation_size: int | None = None
     """27 or 105, for Ant-v5: without or with contact forces."""
     reference_return: float | None = None
-    """Return at which the task is solved, for exploration and beta to follow; by default what is known of it."""
+    """Return at which the task is solved, for exploration, beta and Huber's share to follow; by default what is known
+    of it."""
     allow_import: bool = False
     """Allow an id of the form module:Id, which imports and so runs that module's code."""
 

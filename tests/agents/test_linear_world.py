@@ -21,7 +21,8 @@ from mbdpg.networks.critic import Critics
 from mbdpg.networks.mlp import MLP, Linear
 from mbdpg.networks.policy import Policy
 
-O, A, M, MEMORY, BATCH, GAMMA, BETA = 3, 2, 2, 4, 8, 0.9, 0.6
+O, A, M, MEMORY, BATCH, GAMMA = 3, 2, 2, 4, 8, 0.9
+BETA, BETAS = 0.6, {"beta": 0.5, "final_beta": 0.9}  # a quarter of the way
 ENV = EnvSpec("made-in-code", observation_size=O, action_size=A, episode_limit=None, reference_return=None)
 ALPHA = np.array([0.3, 0.7])
 DELTA, REWARD, TERMINAL_REWARD = np.array([0.5, 1.0, 2.0]), 0.7, 3.0
@@ -68,7 +69,7 @@ def world(survival: float = 0.8) -> State:
     two = jax.tree.map(lambda *x: jnp.stack(x), *(affine(rng, O + A, 1, 0.5) for _ in range(2)))
     critics = eqx.tree_at(lambda x: x.mlps, critics, without_layers(critics.mlps, two))
     scales = Scales(jnp.asarray(DELTA, jnp.float32), jnp.float32(REWARD), jnp.float32(TERMINAL_REWARD))
-    parts = {"average_dynamics": linear_dynamics(rng, survival), "scales": scales}
+    parts = {"average_dynamics": linear_dynamics(rng, survival), "scales": scales, "progress": jnp.float32(0.25)}
     parts |= dict.fromkeys(("actor", "target_actor", "average_actor"), actor)
     parts |= dict.fromkeys(("critics", "target_critics"), critics)
     return eqx.tree_at(lambda x: [getattr(x, name) for name in parts], state, list(parts.values()))
@@ -109,7 +110,7 @@ def start_states() -> Start:
 
 def policy_gradient(state: State, start: Start, **settings) -> tuple[Policy, dict[str, jax.Array]]:
     """The derivative of J, not of the loss -J, and what else the actor's loss returns."""
-    settings = {"saturation_penalty": 0.0, "batch_size": BATCH, "discount": GAMMA, "beta": BETA} | settings
+    settings = {"saturation_penalty": 0.0, "batch_size": BATCH, "discount": GAMMA} | BETAS | settings
     agent = MBDPG(Config(**settings), ENV)
     gradient, (_, _, metrics) = jax.jit(jax.grad(agent._actor_loss, has_aux=True))(state.actor, state, REAL, start, KEY)
     return jax.tree.map(jnp.negative, gradient), metrics
@@ -167,8 +168,8 @@ def test_both_critics_decide_in_the_eq19_test() -> None:
 
 
 def test_without_rewards_the_eq19_gradient_is_that_of_ordinary_dpg() -> None:
-    state, start = mortal_world(), start_states()
-    gradient, metrics = policy_gradient(state, start, gradient="eq19", horizon=1, first_value=0, beta=0.0)
+    state, start, unpaid = mortal_world(), start_states(), {"beta": 0.0, "final_beta": 0.0}
+    gradient, metrics = policy_gradient(state, start, gradient="eq19", horizon=1, first_value=0, **unpaid)
     assert abs(metrics["actor/objective"]) < 1  # so the loss is not divided by its size
     after = imagine(state.average_dynamics, state.scales, state.actor, start.observation, start.memory, horizon=1)
 
@@ -187,7 +188,7 @@ def test_without_rewards_the_eq19_gradient_is_that_of_ordinary_dpg() -> None:
 def test_the_full_gradient_is_that_of_finite_differences(first_value: int, reward_weights: str) -> None:
     """In float64, in the linear world's bends: tanh of the policy, the minimum of the critics, survival."""
     settings = {"horizon": 3, "first_value": first_value, "reward_weights": reward_weights}
-    agent = MBDPG(Config(saturation_penalty=0.0, discount=GAMMA, beta=BETA, **settings), ENV)
+    agent = MBDPG(Config(saturation_penalty=0.0, discount=GAMMA, **BETAS, **settings), ENV)
     everything = mortal_world(), REAL, start_states()
     with jax.enable_x64(True):
         state, real, start = jax.tree.map(lambda x: x.astype(jnp.float64) if x.dtype == jnp.float32 else x, everything)
@@ -209,7 +210,7 @@ def test_the_actors_loss_is_scaled_by_the_objectives_size_without_a_gradient_thr
     state, start = world(), start_states()
     gradient, _ = policy_gradient(state, start, horizon=2)
     scaled = eqx.tree_at(lambda x: x.critics, state, jax.tree.map(lambda x: 100 * x, state.critics))
-    large, metrics = policy_gradient(scaled, start, horizon=2, beta=100 * BETA)
+    large, metrics = policy_gradient(scaled, start, horizon=2, **{name: 100 * beta for name, beta in BETAS.items()})
     ratio = np.linalg.norm(flat(large)) / np.linalg.norm(flat(gradient))
     np.testing.assert_allclose(flat(large), ratio * flat(gradient), rtol=1e-3, atol=1e-5)
     assert 0 < ratio < 100

@@ -315,8 +315,8 @@ def test_the_actor_climbs_the_value_that_it_is_told_to(actor_value: str, reduced
 
 
 @pytest.mark.parametrize(("phase", "loss"), [("improve", "critic/loss"), ("ground", "critic/grounding_loss")])
-def test_large_errors_count_by_their_size_in_both_updates_of_the_critics(phase: str, loss: str) -> None:
-    """With a delta that all errors exceed by far the share of progress is left out, and all of it at its end."""
+def test_large_errors_count_by_their_size_for_a_share_that_follows_the_return(phase: str, loss: str) -> None:
+    """With a delta far below all errors: 1 - progress of the squares is left, and at its end what is in proportion."""
     end = eqx.tree_at(lambda x: x.progress, state(), jnp.ones(()))
 
     def found(before: State, delta: float) -> float:
@@ -466,7 +466,7 @@ def test_rewards_reach_the_critics_in_units_of_value_and_the_model_in_its_own() 
 def test_beta_and_the_spread_of_exploration_follow_the_return(
     progress: float, differences: Callable[..., set[str]]
 ) -> None:
-    moving = MBDPG(Config(**NETWORKS, **SHAPES, beta=3.0, final_beta=1.0), ENV)
+    moving = agent((("beta", 3.0),))
     prepared = jax.jit(moving.prepare)(state(), statistics(progress))
     metrics = update("improve", (("beta", 3.0),))(prepared, BATCHES["improve"])[1]
     assert float(metrics["actor/beta"]) == pytest.approx(3 - 2 * progress)

@@ -52,19 +52,18 @@ class MBDPG:
 
     def prepare(self, state: State, statistics: Statistics) -> State:
         """Take over the replay's scales and how far the return is."""
-        s = statistics
         return eqx.tree_at(
             lambda x: (x.normalizer, x.scales, x.return_scale, x.progress),
             state,
             (
-                Normalizer(s.observation_mean, s.observation_std),
+                Normalizer(statistics.observation_mean, statistics.observation_std),
                 Scales(
-                    s.delta_std / s.observation_std,
-                    s.reward_std / s.return_scale,
-                    s.terminal_reward_scale / s.return_scale,
+                    statistics.delta_std / statistics.observation_std,
+                    statistics.reward_std / statistics.return_scale,
+                    statistics.terminal_reward_scale / statistics.return_scale,
                 ),
-                s.return_scale,
-                s.progress,
+                statistics.return_scale,
+                statistics.progress,
             ),
         )
 
@@ -144,7 +143,6 @@ class MBDPG:
             "critic/skipped": state.critic_optimizer.total_notfinite,
             "actor/grad_norm": optax.tree.norm(gradient),
             "actor/skipped": state.actor_optimizer.total_notfinite,
-            "actor/beta": state.following(c.beta, c.final_beta),
         }
 
     def ground(self, state: State, batch: Batch, *, key: PRNGKeyArray) -> tuple[State, Metrics]:
@@ -165,8 +163,8 @@ class MBDPG:
             return self._critic_loss(state, critics(steps.observation, steps.action), targets, steps.valid)
 
         value, gradient = jax.value_and_grad(loss)(state.critics)
-        following = jnp.maximum(jnp.sum(after.valid), 1.0)  # steps that might be followed
-        metrics = {"critic/grounding_loss": value, "critic/grounding_trace": jnp.sum(trace) / following}
+        steps_after = jnp.maximum(jnp.sum(after.valid), 1.0)
+        metrics = {"critic/grounding_loss": value, "critic/grounding_trace": jnp.sum(trace) / steps_after}
         return self._step_critics(state, gradient), metrics
 
     def _target_value(self, state: State, observation: Array, *, key: PRNGKeyArray) -> Array:
@@ -175,7 +173,7 @@ class MBDPG:
         return objectives.clipped_value(state.target_critics(observation, action))
 
     def _critic_loss(self, state: State, values: Array, targets: Array, weights: Array) -> Array:
-        share = state.progress  # while it learns what a fall costs, large errors are what it has to learn
+        share = state.progress  # early, large errors are news and not noise (results/notebook.md, 84)
         return objectives.critic_loss(values, targets, weights, huber_delta=self.config.huber_delta, huber_share=share)
 
     def _step_critics(self, state: State, gradient: Critics) -> State:
@@ -255,7 +253,12 @@ class MBDPG:
         mean = jnp.sum(objective * start.weight) / count
         size = jax.lax.stop_gradient(jnp.maximum(jnp.sum(jnp.abs(objective) * start.weight) / count, 1.0))
         saturation = jnp.sum(jnp.mean(jnp.square(actor.mlp(start.observation)), axis=-1) * start.weight) / count
-        metrics = {"actor/objective": mean, "actor/saturation": saturation, "actor/survival": jnp.mean(survival[-1])}
+        metrics = {
+            "actor/objective": mean,
+            "actor/saturation": saturation,
+            "actor/survival": jnp.mean(survival[-1]),
+            "actor/beta": beta,
+        }
         return c.saturation_penalty * saturation - mean / size, (imagined, slopes, metrics)
 
     def _targets(self, state: State, window: Window, start: Start, imagined: Trajectory, *, key: PRNGKeyArray) -> Array:
