@@ -346,15 +346,17 @@ def test_training_where_something_is_already_says_resume(say: Any, trained: Path
     [
         (("--episodes", "0"), "--episodes is 0, expected at least 1"),
         (("--seed", "-1"), "--seed is -1, expected at least 0"),
-        (("--video", "film.gif"), "expected a name that ends in .mp4"),
+        (("--video", "film.gif"), "--video is film.gif, expected a name that ends in .mp4"),
+        (("--video", "folder.mp4"), "--video is folder.mp4, a folder; expected a file's name"),
         (("--video", "file/film.mp4"), "cannot write file/film.mp4"),
     ],
     ids=str,
 )
 def test_an_evaluation_that_cannot_be_is_refused(say: Any, trained: Path, flags: Any, said: str) -> None:
     Path("file").write_text("")
+    Path("folder.mp4").mkdir()
     check_refused(say("evaluate", trained, *flags), said)
-    assert [path.name for path in Path.cwd().iterdir()] == ["file"]
+    assert sorted(path.name for path in Path.cwd().rglob("*")) == ["file", "folder.mp4"]
 
 
 @pytest.mark.parametrize(
@@ -459,8 +461,10 @@ def test_an_expert_that_is_stopped_says_how_to_go_on_with_all_that_was_given(say
 def test_what_training_would_refuse_is_refused_before_an_expert_is_trained_for_it(say: Any, trained: Path) -> None:
     """It was said after the 200,000 steps of the expert."""
     shutil.copytree(trained, "x/seed-0")
+    Path("file").write_text("")
     expert = ("--demonstrations", "expert")
-    check_refused(say("train", "Pendulum-v1", *expert, "--out", "x"), "x/seed-0 exists already", "another --out")
+    check_refused(say("train", "Pendulum-v1", *expert, "--out", "x"), "x/seed-0 is not empty", "another --out")
+    check_refused(say("train", "Pendulum-v1", *expert, "--out", "file"), "cannot create file/seed-0")
     oracle = ("--algorithm", "mbpo", "--termination", "known")
     check_refused(say("train", "LunarLanderContinuous-v3", *oracle, *expert, "--out", "y"), "--termination")
     check_refused(say("demonstrate", "LunarLanderContinuous-v3", "--out", "x"), "--out is x, a folder")

@@ -17,11 +17,10 @@ from mbdpg.experiments import presets, run
 from mbdpg.experiments.compilations import keep_compilations
 from mbdpg.experiments.config import Algorithm, RunConfig
 from mbdpg.experiments.stopping import Stop
-from mbdpg.interfaces import UserError
 from mbdpg.reports.comparison import grouped
 from mbdpg.reports.console import RunDisplay
 from mbdpg.reports.record import read_records
-from mbdpg.storage.run_folder import RunFolder
+from mbdpg.storage.run_folder import RunFolder, require_unused
 from mbdpg.training.randomness import checked_seeds
 
 
@@ -52,8 +51,8 @@ def train(args: list[str]) -> None:
     out = flags.run.out or default_folder("runs", config)
     if flags.run.demonstrations == "expert":
         run.check_task(config)
-        for taken in (folder for seed in flags.run.seeds if (folder := out / f"seed-{seed}").exists()):
-            raise UserError(f"{taken} exists already; resume it or choose another --out")
+        for seed in flags.run.seeds:
+            require_unused(out / f"seed-{seed}")
         file = out / "demonstrations.safetensors"
         teacher = Demonstrate(flags.env, file, seed=flags.run.seeds[0], env_options=flags.env_options)
         again = [flags.env, "--out", str(file), "--seed", str(teacher.seed), *as_flags(flags.env_options)]

@@ -67,7 +67,7 @@ class RunFolder:
                         made.callback(_forget, folder.rmdir)
                 _claim(path, data, made)
             except OSError as error:
-                raise UserError(f"cannot create {path}: {error.strerror}; choose another --out") from error
+                raise _not_made(path, error) from error
             kept = made.pop_all()
         if undo is not None:
             undo.push(kept)
@@ -130,6 +130,22 @@ def only_writer(folder: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
+def require_unused(path: Path) -> None:
+    """Look that a run folder can be made there, before anything long begins.
+
+    Raises:
+        UserError: it is there and not an empty folder.
+    """
+    try:
+        content = next(path.iterdir(), None)
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise _not_made(path, error) from error
+    if content is not None:
+        raise _used(path, content)
+
+
 def discard_unbegun(path: Path) -> None:
     """Delete a run folder whose process died before its first checkpoint, when there was nothing to go on from.
 
@@ -168,21 +184,28 @@ def describe_machine() -> dict[str, Any]:
 def _claim(path: Path, data: bytes, undo: contextlib.ExitStack) -> None:
     """Write the config into the empty folder `path`; of two processes that try at once, one succeeds at most."""
     temporary = path / f"{TEMPORARY}{_CONFIG}"
+    require_unused(path)
     try:
-        occupied = next(path.iterdir(), None)
-        if occupied is None:
-            write_durably(temporary, data)
-            undo.callback(_forget, temporary.unlink)
-            # The other process may have begun and ended between the look and the write.
-            occupied = next((other for other in path.iterdir() if other != temporary), None)
+        write_durably(temporary, data)
+        undo.callback(_forget, temporary.unlink)
+        # The other process may have begun and ended between the look and the write.
+        occupied = next((other for other in path.iterdir() if other != temporary), None)
     except FileExistsError:
         occupied = temporary
     if occupied is not None:
-        raise UserError(f"{path} is not empty (it has {occupied.name!r}); resume it or choose another --out")
+        raise _used(path, occupied)
     os.replace(temporary, path / _CONFIG)
     undo.callback(_forget, (path / _CONFIG).unlink)
     sync_folder(path)
     sync_folder(path.parent)
+
+
+def _not_made(path: Path, error: OSError) -> UserError:
+    return UserError(f"cannot create {path}: {error.strerror}; choose another --out")
+
+
+def _used(path: Path, content: Path) -> UserError:
+    return UserError(f"{path} is not empty (it has {content.name!r}); resume it or choose another --out")
 
 
 def _forget(remove: Callable[[], object]) -> None:
