@@ -6,6 +6,7 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
+import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from mbdpg.interfaces import Metrics
@@ -77,17 +78,19 @@ def critic_loss(
     targets: Float[Array, "*batch"],
     weights: Float[Array, "*batch"],
     *,
-    huber_delta: Float[Array, ""] | None = None,
+    huber_delta: float = 0.0,
+    huber_share: float | Float[Array, ""] = 1.0,
 ) -> Float[Array, ""]:
     """Weighted mean square error of every critic to one shared target (Eq. 14, 16), summed over the critics.
 
-    A `huber_delta` is the size of error beyond which the square goes on as its tangent (Huber 1964), so that a few
-    large errors do not outweigh all others.
+    A `huber_delta` above 0 is the size of error beyond which the square goes on as its tangent (Huber 1964), so that
+    a few large errors do not outweigh all others; such is `huber_share` of the loss.
     """
     errors = values - jax.lax.stop_gradient(targets)[None]
-    # Not optax's, whose slope is a difference of two numbers of the size of delta.
-    small = errors if huber_delta is None else jnp.clip(errors, -huber_delta, huber_delta)
-    losses = small * (2.0 * errors - small)
+    losses = jnp.square(errors)
+    if huber_delta > 0.0:
+        huber = 2.0 * optax.losses.huber_loss(errors, delta=huber_delta)
+        losses = (1.0 - huber_share) * losses + huber_share * huber
     return jnp.sum(losses * weights[None]) / jnp.maximum(jnp.sum(weights), 1.0)
 
 

@@ -315,16 +315,15 @@ def test_the_actor_climbs_the_value_that_it_is_told_to(actor_value: str, reduced
 
 
 @pytest.mark.parametrize(("phase", "loss"), [("improve", "critic/loss"), ("ground", "critic/grounding_loss")])
-def test_large_errors_count_by_their_size_from_nearer_on_the_higher_the_return(phase: str, loss: str) -> None:
-    """With a delta far below all errors the loss is in proportion to it."""
+def test_large_errors_count_by_their_size_for_a_share_that_follows_the_return(phase: str, loss: str) -> None:
+    """With a delta far below all errors: 1 - progress of the squares is left, and at its end what is in proportion."""
+    end = eqx.tree_at(lambda x: x.progress, state(), jnp.ones(()))
 
-    def found(progress: float, delta: float) -> float:
-        before = eqx.tree_at(lambda x: x.progress, state(), jnp.asarray(progress))
+    def found(before: State, delta: float) -> float:
         return float(update(phase, (("huber_delta", delta),))(before, BATCHES[phase])[1][loss])
 
-    assert found(1.0, 2e-5) == pytest.approx(2 * found(1.0, 1e-5), rel=1e-2)
-    assert found(0.5, 1e-5) == pytest.approx(8 * found(1.0, 1e-5), rel=1e-2)
-    assert found(0.0, 1e-5) == found(1.0, 0.0)
+    assert found(end, 2e-5) == pytest.approx(2 * found(end, 1e-5), rel=1e-2)
+    assert found(state(), 1e-5) == pytest.approx((1 - float(state().progress)) * found(state(), 0.0), rel=1e-2)
 
 
 def test_targets_wait_for_the_third_update_where_c_is_3(differences: Callable[..., set[str]]) -> None:

@@ -98,17 +98,18 @@ def test_the_critic_loss_is_a_weighted_mean_per_critic(critics: int, shape: tupl
     assert float(loss) == pytest.approx(total / weights.sum(), rel=1e-5)
 
 
-@pytest.mark.parametrize("delta", [2.0, 1e6])
-def test_errors_beyond_delta_pull_no_harder_than_delta(delta: float) -> None:
+@pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
+def test_errors_beyond_delta_pull_no_harder_than_delta_for_their_share(share: float) -> None:
     errors = jnp.asarray([[-30.0, -2.0, -0.5, 0.0, 1.5, 7.0]])
 
     def loss(values):
-        return objectives.critic_loss(values, jnp.zeros(6), jnp.ones(6), huber_delta=jnp.asarray(delta))
+        return objectives.critic_loss(values, jnp.zeros(6), jnp.ones(6), huber_delta=2.0, huber_share=share)
 
     value, slope = jax.value_and_grad(loss)(errors)
-    total = 2 * (60 - 2) + 4 + 0.25 + 2.25 + 2 * (14 - 2) if delta == 2 else 900 + 4 + 0.25 + 2.25 + 49
-    assert float(value) == pytest.approx(total / 6, rel=1e-6)
-    np.testing.assert_allclose(slope[0], 2 * np.clip(errors[0], -delta, delta) / 6, rtol=1e-6)
+    squares, hubers = 900 + 4 + 0.25 + 2.25 + 49, 2 * (60 - 2) + 4 + 0.25 + 2.25 + 2 * (14 - 2)
+    assert float(value) == pytest.approx(((1 - share) * squares + share * hubers) / 6, rel=1e-6)
+    cut = np.asarray([-2.0, -2.0, -0.5, 0.0, 1.5, 2.0])
+    np.testing.assert_allclose(slope[0], 2 * ((1 - share) * errors[0] + share * cut) / 6, rtol=1e-6)
 
 
 def test_the_critic_loss_moves_values_and_never_targets() -> None:

@@ -173,10 +173,8 @@ class MBDPG:
         return objectives.clipped_value(state.target_critics(observation, action))
 
     def _critic_loss(self, state: State, values: Array, targets: Array, weights: Array) -> Array:
-        delta = self.config.huber_delta
-        # While returns are low large errors are news and not noise (results/notebook.md, 84).
-        bound = delta / jnp.maximum(state.progress, 1e-3) ** 3 if delta > 0.0 else None
-        return objectives.critic_loss(values, targets, weights, huber_delta=bound)
+        share = state.progress  # early, large errors are news and not noise (results/notebook.md, 84)
+        return objectives.critic_loss(values, targets, weights, huber_delta=self.config.huber_delta, huber_share=share)
 
     def _step_critics(self, state: State, gradient: Critics) -> State:
         """Step the critics, then let the targets follow every C-th time."""

@@ -54,8 +54,8 @@ class Config:
     imagined_weight: float = 0.5
     """Weight of the critic's loss on imagined states beside that on real transitions."""
     huber_delta: float = 0.0
-    """Critics' errors beyond it, in root mean squares of reward, count by size instead of square, once the return is at
-    the reference return; beyond 8 times it half way there, and so on with the cube; 0 or no such return: none."""
+    """Critics' errors beyond it, in root mean squares of reward, count by size instead of square: for as large a share
+    of the loss as the return is on its way to the reference return, none where there is no such; 0: all by square."""
     imagination_ratio: float = 0.0
     """Share of imagination that starts from the imagination buffer instead of the environment's."""
     imagination_depth: int = 20
