@@ -1,6 +1,7 @@
 """What the runs of a task came to, beside what others have published (published.csv).
 
     python results/collect.py NAME RUN...     # run folders; without any, what NAME.csv has already
+    python results/collect.py                 # all tasks beside each other: overview.png
 
 NAME.csv gets every evaluation of the runs, and keeps those of other seeds; NAME.png has every seed's curve and the mean
 over seeds, beside those of the rivals that were run on the same task (RIVALS). Printed are, per algorithm and budget:
@@ -14,7 +15,9 @@ import sys
 from collections import defaultdict
 from pathlib import Path
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from mbdpg.reports.curves import draw_seeds
 from mbdpg.reports.statistics import summarize
@@ -24,6 +27,9 @@ from mbdpg.storage.run_folder import RunFolder
 
 HERE = Path(__file__).parent
 BUDGETS = (50_000, 100_000)
+TASKS = ("half_cheetah", "hopper", "ant", "bipedal_walker", "lunar_lander")
+"""Files of overview.png, in its order."""
+COLORS = {"mbdpg": "C0", "td3": "C1", "sac": "C2", "mbpo": "C3", "pets": "C4"}
 RIVALS = ("mbpo", "peers")
 """Files whose runs of ours on the same task are drawn beside those of NAME.csv."""
 WHOSE = ("env", "algorithm", "seed", "commit")
@@ -114,25 +120,54 @@ def tell(curves: dict[str, Curves]) -> None:
                 print(f"| {algorithm} | {budget:,} | {s.seeds} | {mean} | {middle} |")
 
 
-def draw(name: str, env: str, curves: dict[str, Curves]) -> None:
-    """Write NAME.png: our curves, and what others have published of theirs."""
-    figure = Figure(figsize=(8, 6), layout="constrained")
-    axes = figure.subplots()
-    for number, (algorithm, seeds) in enumerate(curves.items()):
-        draw_seeds(axes, [*seeds.values()], label=algorithm, color=f"C{number}")
+def _published(env: str) -> dict[tuple[str, str], list[tuple[int, float]]]:
+    """Others' means over seeds of a task in any version: steps and return, by method and version."""
     others = defaultdict(list)
     with open(HERE / "published.csv", newline="") as file:
         for row in csv.DictReader(file):
             if row["env"] == env.rpartition("-v")[0]:
                 others[row["method"], row["id"]].append((int(row["env_steps"]), float(row["mean"])))
-    for style, ((method, version), points) in enumerate(others.items()):
+    return others
+
+
+def _draw_ours(axes: Axes, curves: dict[str, Curves]) -> None:
+    for algorithm, seeds in curves.items():
+        draw_seeds(axes, [*seeds.values()], label=algorithm, color=COLORS[algorithm])
+    axes.grid(alpha=0.3)
+
+
+def draw(name: str, env: str, curves: dict[str, Curves]) -> None:
+    """Write NAME.png: our curves, and what others have published of theirs."""
+    figure = Figure(figsize=(8, 6), layout="constrained")
+    axes = figure.subplots()
+    _draw_ours(axes, curves)
+    for style, ((method, version), points) in enumerate(_published(env).items()):
         line, mark = (LINES[style % len(LINES)], "") if len(points) > 2 else ("", MARKS[style % len(MARKS)])
         drawn = {"color": "0.35", "fillstyle": "none", "linewidth": 1, "linestyle": line, "marker": mark}
         axes.plot(*zip(*points, strict=True), label=f"{method} ({version}, published)", **drawn)
     axes.set(xlabel="environment steps", ylabel="evaluation return", title=env)
-    axes.grid(alpha=0.3)
     figure.legend(loc="outside lower center", ncols=2, fontsize="small")  # where it hides no curve
     figure.savefig(HERE / f"{name}.png", dpi=110)
+
+
+def draw_overview() -> None:
+    """Write overview.png: the same of all TASKS, what others have published in gray."""
+    figure = Figure(figsize=(16, 3.6), layout="constrained")
+    panels = figure.subplots(1, len(TASKS))
+    panels[0].set_ylabel("evaluation return")
+    seen = set()
+    for axes, name in zip(panels, TASKS, strict=True):
+        env, curves = read(name)
+        _draw_ours(axes, curves)
+        seen |= set(curves)
+        for points in _published(env).values():
+            mark = "" if len(points) > 2 else "o"
+            axes.plot(*zip(*points, strict=True), color="0.6", linewidth=1, marker=mark, markersize=4)
+        axes.set(title=env, xlabel="environment steps", xticks=range(0, 150_000, 50_000))
+    lines = [Line2D([], [], color=color, label=f"{name}, here") for name, color in COLORS.items() if name in seen]
+    lines.append(Line2D([], [], color="0.6", marker="o", markersize=4, label="others, as published"))
+    figure.legend(handles=lines, loc="outside lower center", ncols=len(lines))
+    figure.savefig(HERE / "overview.png", dpi=100)
 
 
 def main(name: str, runs: list[Path]) -> None:
@@ -145,4 +180,7 @@ def main(name: str, runs: list[Path]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], [Path(run) for run in sys.argv[2:]])
+    if sys.argv[1:]:
+        main(sys.argv[1], [Path(run) for run in sys.argv[2:]])
+    else:
+        draw_overview()

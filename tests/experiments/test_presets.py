@@ -83,7 +83,7 @@ def test_a_task_of_its_own_settings_keeps_all_others() -> None:
     assert agent_config("mbdpg", "default", "BipedalWalker-v3") == mbdpg.Config(grounding_tolerance=1000.0)
     assert agent_config("mbdpg", "default", "Pendulum-v1") == mbdpg.Config()
     recent = {"recent_steps": 10_000, "recent_terminations": 20}
-    hopper = mbdpg.Config(planning="stochastic", discount=0.995, actor_value="mean", **recent)
+    hopper = mbdpg.Config(planning="stochastic", discount=0.995, actor_value="mean", huber_delta=1.0, **recent)
     assert agent_config("mbdpg", "default", "Hopper-v5") == hopper
     cheetah = mbdpg.Config(planning="stochastic", discount=0.98)
     assert agent_config("mbdpg", "default", "HalfCheetah-v4") == cheetah
