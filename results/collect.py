@@ -161,8 +161,8 @@ def draw_overview() -> None:
         _draw_ours(axes, curves)
         seen |= set(curves)
         for points in _published(env).values():
-            mark = "" if len(points) > 2 else "o"
-            axes.plot(*zip(*points, strict=True), color="0.6", linewidth=1, marker=mark, markersize=4)
+            line, mark = ("-", "") if len(points) > 2 else ("", "o")
+            axes.plot(*zip(*points, strict=True), color="0.6", linewidth=1, linestyle=line, marker=mark, markersize=4)
         axes.set(title=env, xlabel="environment steps", xticks=range(0, 150_000, 50_000))
     lines = [Line2D([], [], color=color, label=f"{name}, here") for name, color in COLORS.items() if name in seen]
     lines.append(Line2D([], [], color="0.6", marker="o", markersize=4, label="others, as published"))

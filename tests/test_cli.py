@@ -23,6 +23,7 @@ import mbdpg
 from mbdpg.cli import VERBS, main
 from mbdpg.experiments import expert
 from mbdpg.experiments.pool import Local
+from mbdpg.interfaces import UserError
 from mbdpg.storage.run_folder import RunFolder
 
 Start = Callable[..., "subprocess.Popen[str]"]
@@ -346,17 +347,15 @@ def test_training_where_something_is_already_says_resume(say: Any, trained: Path
     [
         (("--episodes", "0"), "--episodes is 0, expected at least 1"),
         (("--seed", "-1"), "--seed is -1, expected at least 0"),
-        (("--video", "film.gif"), "--video is film.gif, expected a name that ends in .mp4"),
-        (("--video", "folder.mp4"), "--video is folder.mp4, a folder; expected a file's name"),
+        (("--video", "film.gif"), "expected a name that ends in .mp4"),
         (("--video", "file/film.mp4"), "cannot write file/film.mp4"),
     ],
     ids=str,
 )
 def test_an_evaluation_that_cannot_be_is_refused(say: Any, trained: Path, flags: Any, said: str) -> None:
     Path("file").write_text("")
-    Path("folder.mp4").mkdir()
     check_refused(say("evaluate", trained, *flags), said)
-    assert sorted(path.name for path in Path.cwd().rglob("*")) == ["file", "folder.mp4"]
+    assert [path.name for path in Path.cwd().iterdir()] == ["file"]
 
 
 @pytest.mark.parametrize(
@@ -456,6 +455,17 @@ def test_an_expert_that_is_stopped_says_how_to_go_on_with_all_that_was_given(say
     run, file = "x/demonstrations-expert/seed-4", "x/demonstrations.safetensors"
     again = f"mbdpg demonstrate Ant-v5 --out {file} --seed 4 --observation-size 27 --expert {run}"
     assert said == Said(143, "", f"{go_on} {run}, then {again}, then this again with --demonstrations {file}\n")
+
+
+def test_an_empty_run_folder_will_do_where_an_expert_comes_first(say: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was refused, but only with --demonstrations expert."""
+
+    def made(*arguments: Any, **others: Any) -> None:
+        raise UserError("here an expert is trained")
+
+    monkeypatch.setattr("mbdpg.cli.train.make_demonstrations", made)
+    Path("x/seed-0").mkdir(parents=True)
+    check_refused(say("train", "Pendulum-v1", "--demonstrations", "expert", "--out", "x"), "here an expert is trained")
 
 
 def test_what_training_would_refuse_is_refused_before_an_expert_is_trained_for_it(say: Any, trained: Path) -> None:

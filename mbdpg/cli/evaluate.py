@@ -15,7 +15,6 @@ from mbdpg.experiments.config import RunConfig
 from mbdpg.experiments.run import load_policy
 from mbdpg.interfaces import require
 from mbdpg.reports.video import VideoWriter
-from mbdpg.storage.files import require_place
 from mbdpg.storage.run_folder import RunFolder
 from mbdpg.training import evaluation
 
@@ -48,8 +47,6 @@ def evaluate(args: list[str]) -> None:
     folder = RunFolder.open(flags.run)
     config = RunConfig.of(folder)
     require(not folder.config.get("custom_env"), f"{flags.run} trained an environment made in code: use mbdpg.evaluate")
-    if flags.video is not None:
-        require_place(flags.video, "--video", suffix=".mp4")
     # Nobody but the person at the keyboard may decide that code is imported.
     options = dataclasses.replace(config.env_options, allow_import=flags.allow_import)
     seeds = [envs.episode_seed(flags.seed, "test", i) for i in range(flags.episodes)]

@@ -131,10 +131,10 @@ def only_writer(folder: Path) -> Iterator[None]:
 
 
 def require_unused(path: Path) -> None:
-    """Look that a run folder can be made there, before anything long begins.
+    """Refuse a run folder's place that is not free.
 
     Raises:
-        UserError: it is there and not an empty folder.
+        UserError: it is there and not an empty folder that can be read.
     """
     try:
         content = next(path.iterdir(), None)

@@ -28,7 +28,7 @@ def told(path: Path) -> str:
 def test_a_video_has_the_frames_that_were_given_in_their_order_and_size(
     tmp_path: Path, height: int, width: int
 ) -> None:
-    path = tmp_path / "film.mp4"
+    path = tmp_path / "new" / "film.mp4"
     with VideoWriter(path, frames_per_second=25.0) as film:
         for frame in frames(10, height, width):
             film(frame)
@@ -45,6 +45,13 @@ def test_a_video_can_be_played_where_only_the_common_pixel_format_is_known(tmp_p
             film(frame)
     said = told(tmp_path / "film.mp4")
     assert "h264" in said and "yuv420p" in said
+
+
+@pytest.mark.parametrize("name", ["film", "film.gif", "film.MP4x"])
+def test_another_ending_is_refused_before_anything_is_written(tmp_path: Path, name: str) -> None:
+    with pytest.raises(UserError, match=rf"^--video is .*{name}, expected a name that ends in \.mp4$"):
+        VideoWriter(tmp_path / name, frames_per_second=50.0)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_where_no_file_can_be_written_one_line_says_so(tmp_path: Path) -> None:
