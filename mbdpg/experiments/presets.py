@@ -85,7 +85,7 @@ TASKS: dict[str, dict[str, dict[str, dict[str, Any]]]] = {
             "HalfCheetah": {"planning": "stochastic", "discount": 0.98},  # 39, 41: late it exploits the mean's errors
             # 50, 81: with 0.99 it leaps, or runs and falls; 69, 71: the lesser critic fears speeds that it has not seen
             # 74, 77: older steps, of policies that earned less, hold it back, but for falls, which else it forgets
-            # 80, 84, 85: by their squares a few large errors of its critics outweigh all others
+            # 80, 84, 85: with large errors of its critics by their size it gets beyond where squares stand still
             "Hopper": {
                 "planning": "stochastic",
                 "discount": 0.995,
