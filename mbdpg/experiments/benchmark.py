@@ -6,6 +6,7 @@ Every time is the median of a few calls on this machine at this moment; compare 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import os
 import resource
@@ -214,6 +215,7 @@ def made_up_batches(phase: Phase, updates: int) -> Any:
     return _replay(ROWS).sample(updates, phase.sampling, np.random.default_rng(0))
 
 
+@functools.cache
 def _replay(rows: int) -> Replay:
     """Made-up steps, in episodes of 1,000."""
     replay, rng = Replay(SPEC.observation_size, SPEC.action_size), np.random.default_rng(0)

@@ -35,10 +35,6 @@ class Learner:
         Raises:
             MemoryError: the states alone are larger than this machine's memory, at which XLA would abort the process.
         """
-        state = jax.eval_shape(lambda: agent.init(key=jax.random.key(0)))
-        size = len(seeds) * sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
-        if size > os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"):
-            raise MemoryError(f"the networks and their optimizers take {size / 2**30:.0f} GiB")
         self.agent = agent
         mesh = seed_mesh(len(seeds), jax.local_devices() if devices is None else devices)
         numbers: Any = np.asarray(seeds, np.uint32)
@@ -49,7 +45,11 @@ class Learner:
             key = jax.random.key(seed)
             return key, agent.init(key=jax.random.fold_in(key, 0))
 
-        self._keys, self.state = jax.jit(over_seeds(begin, mesh))(numbers)
+        begun = jax.jit(over_seeds(begin, mesh)).trace(numbers)
+        size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(begun.out_info[1]))
+        if size > os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"):
+            raise MemoryError(f"the networks and their optimizers take {size / 2**30:.0f} GiB")
+        self._keys, self.state = begun.lower().compile()(numbers)
         self._prepare = jax.jit(over_seeds(agent.prepare, mesh), donate_argnums=0)
         self._diagnose = jax.jit(over_seeds(agent.diagnose, mesh))
         self._updates = {phase.name: _compile(phase, 1 + i, mesh) for i, phase in enumerate(agent.phases)}
