@@ -3,9 +3,9 @@
     python results/collect.py NAME RUN...     # run folders; without any, what NAME.csv has already
     python results/collect.py                 # all tasks beside each other: overview.png
 
-NAME.csv gets every evaluation of the runs, and keeps those of other seeds; NAME.png has every seed's curve and the mean
-over seeds, beside those of the rivals that were run on the same task (RIVALS). Printed are, per algorithm and budget:
-seeds, mean, standard deviation, and interquartile mean with its 95 % bootstrap interval.
+NAME.csv gets every evaluation of the runs, and keeps those of other seeds and algorithms; NAME.png has every seed's
+curve and the mean over seeds, with our TD3 and SAC of peers.csv where NAME.csv has none. Printed are, per algorithm and
+budget: seeds, mean, standard deviation, and interquartile mean with its 95 % bootstrap interval.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ from __future__ import annotations
 import csv
 import sys
 from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -30,8 +32,6 @@ BUDGETS = (50_000, 100_000)
 TASKS = ("half_cheetah", "hopper", "ant", "bipedal_walker", "lunar_lander")
 """Files of overview.png, in its order."""
 COLORS = {"mbdpg": "C0", "td3": "C1", "sac": "C2", "mbpo": "C3", "pets": "C4"}
-RIVALS = ("mbpo", "peers")
-"""Files whose runs of ours on the same task are drawn beside those of NAME.csv."""
 WHOSE = ("env", "algorithm", "seed", "commit")
 COLUMNS = (
     "env_steps",
@@ -62,10 +62,7 @@ Curves = dict[str, dict[int, float]]
 
 def collect(name: str, runs: list[Path]) -> None:
     """Write the runs into NAME.csv, in the place of what it has of the same tasks, algorithms and seeds."""
-    table: list[dict[str, str]] = []
-    if (HERE / f"{name}.csv").exists():
-        with open(HERE / f"{name}.csv", newline="") as file:
-            table = list(csv.DictReader(file))
+    table = _rows(name) if (HERE / f"{name}.csv").exists() else []
     for run in runs:
         config = RunFolder.open(run).config
         commit = config["commit"] or ""
@@ -88,24 +85,24 @@ def _shown(value: object) -> str:
 
 
 def read(name: str) -> tuple[str, dict[str, Curves]]:
-    """The task of NAME.csv, and learning curves by algorithm: its own, and its rivals' on the same task."""
-    curves: dict[str, Curves] = defaultdict(lambda: defaultdict(dict))
-    env = _add(curves, name, None)
-    for rival in RIVALS:
-        _add(curves, rival, env)
-    return env, curves
+    """The task of NAME.csv, and learning curves by algorithm: its own, and of peers.csv those that it lacks."""
+    own = _rows(name)
+    env = own[0]["env"]
+    curves = _curves(own, "eval/return_mean")
+    ours = [row for row in _rows("peers") if row["env"] == env and row["program"] == "mbdpg"]
+    return env, _curves(ours, "return_mean") | curves
 
 
-def _add(curves: dict[str, Curves], name: str, env: str | None) -> str:
-    """Add what a file has of a task, by default that of its first row; returns the task."""
+def _rows(name: str) -> list[dict[str, str]]:
     with open(HERE / f"{name}.csv", newline="") as file:
-        for row in csv.DictReader(file):
-            env = env or row["env"]
-            if row["env"] == env and row.get("program", "mbdpg") == "mbdpg":
-                score = row["eval/return_mean"] if "eval/return_mean" in row else row["return_mean"]
-                curves[row["algorithm"]][row["seed"]][int(row["env_steps"])] = float(score)
-    assert env is not None
-    return env
+        return list(csv.DictReader(file))
+
+
+def _curves(rows: list[dict[str, str]], score: str) -> dict[str, Curves]:
+    curves: dict[str, Curves] = defaultdict(lambda: defaultdict(dict))
+    for row in rows:
+        curves[row["algorithm"]][row["seed"]][int(row["env_steps"])] = float(row[score])
+    return curves
 
 
 def tell(curves: dict[str, Curves]) -> None:
@@ -123,10 +120,9 @@ def tell(curves: dict[str, Curves]) -> None:
 def _published(env: str) -> dict[tuple[str, str], list[tuple[int, float]]]:
     """Others' means over seeds of a task in any version: steps and return, by method and version."""
     others = defaultdict(list)
-    with open(HERE / "published.csv", newline="") as file:
-        for row in csv.DictReader(file):
-            if row["env"] == env.rpartition("-v")[0]:
-                others[row["method"], row["id"]].append((int(row["env_steps"]), float(row["mean"])))
+    for row in _rows("published"):
+        if row["env"] == env.rpartition("-v")[0]:
+            others[row["method"], row["id"]].append((int(row["env_steps"]), float(row["mean"])))
     return others
 
 
@@ -136,15 +132,20 @@ def _draw_ours(axes: Axes, curves: dict[str, Curves]) -> None:
     axes.grid(alpha=0.3)
 
 
+def _draw_published(axes: Axes, env: str, lines: Sequence[str], marks: Sequence[str], **drawn: Any) -> None:
+    """A line for each method of others, but marks where it has one or two numbers only."""
+    for number, ((method, version), points) in enumerate(_published(env).items()):
+        line, mark = lines[number % len(lines)], marks[number % len(marks)]
+        drawn |= {"linestyle": line, "marker": ""} if len(points) > 2 else {"linestyle": "", "marker": mark}
+        axes.plot(*zip(*points, strict=True), label=f"{method} ({version}, published)", linewidth=1, **drawn)
+
+
 def draw(name: str, env: str, curves: dict[str, Curves]) -> None:
     """Write NAME.png: our curves, and what others have published of theirs."""
     figure = Figure(figsize=(8, 6), layout="constrained")
     axes = figure.subplots()
     _draw_ours(axes, curves)
-    for style, ((method, version), points) in enumerate(_published(env).items()):
-        line, mark = (LINES[style % len(LINES)], "") if len(points) > 2 else ("", MARKS[style % len(MARKS)])
-        drawn = {"color": "0.35", "fillstyle": "none", "linewidth": 1, "linestyle": line, "marker": mark}
-        axes.plot(*zip(*points, strict=True), label=f"{method} ({version}, published)", **drawn)
+    _draw_published(axes, env, LINES, MARKS, color="0.35", fillstyle="none")
     axes.set(xlabel="environment steps", ylabel="evaluation return", title=env)
     figure.legend(loc="outside lower center", ncols=2, fontsize="small")  # where it hides no curve
     figure.savefig(HERE / f"{name}.png", dpi=110)
@@ -160,9 +161,7 @@ def draw_overview() -> None:
         env, curves = read(name)
         _draw_ours(axes, curves)
         seen |= set(curves)
-        for points in _published(env).values():
-            line, mark = ("-", "") if len(points) > 2 else ("", "o")
-            axes.plot(*zip(*points, strict=True), color="0.6", linewidth=1, linestyle=line, marker=mark, markersize=4)
+        _draw_published(axes, env, "-", "o", color="0.6", markersize=4)
         axes.set(title=env, xlabel="environment steps", xticks=range(0, 150_000, 50_000))
     lines = [Line2D([], [], color=color, label=f"{name}, here") for name, color in COLORS.items() if name in seen]
     lines.append(Line2D([], [], color="0.6", marker="o", markersize=4, label="others, as published"))
