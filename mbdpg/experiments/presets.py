@@ -79,13 +79,13 @@ TASKS: dict[str, dict[str, dict[str, dict[str, Any]]]] = {
     # more thing to know, and have their numbers in the notebook.
     "default": {
         "mbdpg": {
-            # 36, 37: on the mean, and where episodes explore widely, it falls and does not walk
+            # 36, 37: on the mean, and where episodes explore widely, it falls and does not walk; 43: the discount
             "Ant": {"planning": "stochastic", "discount": 0.98, "exploration_std": 0.1},
             "BipedalWalker": {"grounding_tolerance": 1000.0},  # 47, 49, 61: real returns cut short unlearn its gait
             "HalfCheetah": {"planning": "stochastic", "discount": 0.98},  # 39, 41: late it exploits the mean's errors
             # 50, 81: with 0.99 it leaps, or runs and falls; 69, 71: the lesser critic fears speeds that it has not seen
             # 74, 77: older steps, of policies that earned less, hold it back, but for falls, which else it forgets
-            # 80, 84, 85: with large errors of its critics by their size it gets beyond where squares stand still
+            # 80, 84, 85: with large errors of its critics by their size one seed of three gets well beyond squares
             "Hopper": {
                 "planning": "stochastic",
                 "discount": 0.995,

@@ -148,7 +148,8 @@ class MBDPG:
     def ground(self, state: State, batch: Batch, *, key: PRNGKeyArray) -> tuple[State, Metrics]:
         """One update of the critics on real steps alone (Eq. 14 with targets and clipping), by returns over several.
 
-        A return follows what was done while it resembles what the policy does, as in Retrace (Munos et al. 2016).
+        A return follows what was done while it resembles what the policy does: cut as in Retrace (Munos et al. 2016),
+        without its correction for actions that the policy would not have taken.
         """
         steps = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), state.window(batch))
         values = self._target_value(state, steps.next_observation, key=key)
