@@ -148,8 +148,7 @@ class MBDPG:
     def ground(self, state: State, batch: Batch, *, key: PRNGKeyArray) -> tuple[State, Metrics]:
         """One update of the critics on real steps alone (Eq. 14 with targets and clipping), by returns over several.
 
-        A return follows what was done while it resembles what the policy does: cut as in Retrace (Munos et al. 2016),
-        without its correction for actions that the policy would not have taken.
+        A return follows what was done while it resembles what the policy does, and is cut there without correction.
         """
         steps = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), state.window(batch))
         values = self._target_value(state, steps.next_observation, key=key)
