@@ -109,14 +109,15 @@ class RunConfig:
         """
         algorithm = data.get("algorithm")
         require(
-            algorithm in CONFIGS, f"config.json has algorithm {str(algorithm)[:40]!r}, expected {', '.join(CONFIGS)}"
+            isinstance(algorithm, str) and algorithm in CONFIGS,
+            f"config.json has algorithm {str(algorithm)[:40]!r}, expected {', '.join(CONFIGS)}",
         )
         demonstrations, env = data.get("demonstrations"), data.get("env")
         require(isinstance(env, str), "config.json does not say which environment the run is of")
         require(demonstrations is None or isinstance(demonstrations, str), "config.json has odd demonstrations")
         return cls(
             env=str(env),
-            agent=_settings(CONFIGS[algorithm], data.get("agent"), "agent"),  # type: ignore[index]
+            agent=_settings(CONFIGS[str(algorithm)], data.get("agent"), "agent"),
             schedule=_settings(Schedule, data.get("schedule"), "schedule"),
             env_options=_settings(EnvOptions, data.get("env_options"), "env_options"),
             demonstrations=demonstrations,
@@ -129,6 +130,7 @@ _KINDS = {bool: "true or false", int: "a whole number", float: "a number"}
 def _settings(kind: type[Any], data: Any, name: str) -> Any:
     """A config dataclass from JSON, refusing what it does not know and what has another type than its default."""
     known = {field.name: field.default for field in dataclasses.fields(kind)}
+    types = {field.name: str(field.type) for field in dataclasses.fields(kind)}
     require(isinstance(data, dict), f"config.json has no {name}")
     require(
         data.keys() == known.keys(),
@@ -137,8 +139,10 @@ def _settings(kind: type[Any], data: Any, name: str) -> Any:
     )
     for key, default in known.items():
         value, number = data[key], (int, float)
-        kinds = (*number, type(None)) if default is None else number if isinstance(default, float) else type(default)
+        whole = default is None and "int" in types[key]
+        unset = (int, type(None)) if whole else (*number, type(None))
+        kinds = unset if default is None else number if isinstance(default, float) else type(default)
         fits = isinstance(value, kinds) and (isinstance(default, bool) or not isinstance(value, bool))
-        kind_of = "a number or null" if default is None else _KINDS.get(type(default), "text")
+        kind_of = f"a {'whole ' * whole}number or null" if default is None else _KINDS.get(type(default), "text")
         require(fits, f"config.json has {name}.{key} = {json.dumps(value)[:40]}, expected {kind_of}")
     return kind(**data)

@@ -318,6 +318,7 @@ def test_a_longer_run_begins_where_the_shorter_ended(toy_run: Path, tmp_path: Pa
     ("changes", "said"),
     [
         ({"algorithm": "ppo"}, "config.json has algorithm 'ppo', expected mbdpg, td3, sac, pets, mbpo"),
+        ({"algorithm": ["td3"]}, "config.json has algorithm"),
         ({"env": None}, "does not say which environment"),
         ({"agent": None}, "config.json has no agent"),
         (
@@ -334,6 +335,10 @@ def test_a_longer_run_begins_where_the_shorter_ended(toy_run: Path, tmp_path: Pa
             "expected float32[3, 8]",
         ),
         ({"demonstrations": 3}, "config.json has odd demonstrations"),
+        (
+            {"env_options": dataclasses.asdict(TOY.env_options) | {"max_episode_steps": 1.5}},
+            "env_options.max_episode_steps = 1.5, expected a whole number or null",
+        ),
     ],
     ids=lambda value: "" if isinstance(value, dict) else value[:40],
 )
